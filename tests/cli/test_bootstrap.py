@@ -52,17 +52,6 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys
     assert d["variance_factor"] == pytest.approx(found["variance_factor"], rel=1e-6)
 
 
-@pytest.mark.long
-def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
-    old = imported(tmp_path / "old.hilcal", "nothing", 2, then=("identify",))
-    new = imported(tmp_path / "new.hilcal", "joint_tilt_compliance")
-    out = ok(capsys, "identify", new, "--prior", old).out
-    assert "leaves more than the noise; hilcal compare EARLIER LATER" in " ".join(out.split())
-    more = "base_frame,joint_compliance,joint_tilt_compliance"
-    out = ok(capsys, "identify", new, "--prior", old, "--effects", more).out
-    assert "did not have joint_tilt_compliance; hilcal compare" in " ".join(out.split())
-
-
 def imported_readings(readings, folder, capsys):
     write_table(readings, folder / "t.csv", INSTRUMENT_AND_ARM)
     run = folder / "run.hilcal"

@@ -1,7 +1,6 @@
 """The commands from import to view: exit codes, documents, words, one verdict everywhere."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +13,8 @@ from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.effects.catalogue import installed
-from hilcal.identification.baseline import baseline
 from hilcal.present.story import build_story
 from hilcal.present.verdict import message
-from hilcal.refinement import refine
 from hilcal.store.campaign_file import CampaignFile
 from studies.diagnosis import judgement
 from studies.serial_noise import serial_readings
@@ -400,30 +397,6 @@ def test_one_verdict_through_every_door(case, tmp_path, capsys):
             assert record.result_json["diagnose"]["verdict"] == row["verdict"]
     again = ok(capsys, "refine", path, "--from-latest", "--json").document
     assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
-
-
-@pytest.mark.long
-def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch):
-    """The effect that each step adds is the first suspect of the step before."""
-    hidden = ("backlash", "joint_tilt_compliance")
-    c = study_case(UR5E, "ur5e", "deflection", hidden, 3.0, 0, n_poses=16)
-    answers = iter([False])  # the first trial does not lower the error on poses left out
-
-    def predicts_better(before, after):
-        return next(answers, None) is None and judged(before, after)
-
-    refinement = sys.modules["hilcal.refinement"]  # hilcal.refine is a function of the library
-    judged = refinement.predicts_better
-    monkeypatch.setattr(refinement, "predicts_better", predicts_better)
-    start = baseline(c.cell, c.readings, "deflection")
-    r = refine(start, c.readings, "deflection", background=False)
-    assert len(r.rejected) == 1
-    assert r.diagnosis is r.steps[-1].diagnosis
-    for before, after in zip(r.steps, r.steps[1:], strict=False):
-        if after.removed is None:
-            assert before.diagnosis.suspects[0].effect == after.added
-    for step in r.steps:
-        assert set(step.diagnosis.significant).isdisjoint(step.diagnosis.history.rejected)
 
 
 @pytest.mark.slow

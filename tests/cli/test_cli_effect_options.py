@@ -71,17 +71,6 @@ def test_add_takes_options(campaign, capsys):
     assert "hysteresis" not in revisions(campaign)[-1][2]
 
 
-@pytest.mark.long
-def test_refine_starts_from_options(campaign, capsys):
-    chosen = "joint_compliance(joints=1/2/3/4-6)"
-    d = ok(capsys, "refine", campaign, "--effects", chosen, "--json").document
-    joints = [r["options"]["joint_compliance"]["joints"] for r in d["revisions"]]
-    assert joints[0] == "1/2/3/4-6"
-    assert joints[-1] == "each"  # the simulated joints differ
-    added = {r["added"] for r in d["revisions"][1:]}
-    assert added == {"hysteresis", "joint_compliance(joints=each)"}
-
-
 def test_effects_shows_options_and_defaults(capsys):
     d = {e["name"]: e for e in ok(capsys, "effects", "--json").document["effects"]}
     assert d["backlash"]["options"] == ["joints", "crossing"]

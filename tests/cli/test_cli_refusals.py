@@ -1,12 +1,10 @@
 """What is wrong is said in one line, with the exit code of its kind."""
 
-import re
 import shlex
 import signal
 import socket
 import sys
 import warnings
-from pathlib import Path
 
 import pytest
 
@@ -34,11 +32,6 @@ def good(tmp_path_factory):
 @pytest.fixture
 def campaign(tmp_path):
     return imported(tmp_path / "run.hilcal", "nothing", poses=6)
-
-
-@pytest.fixture
-def fitted(tmp_path):
-    return imported(tmp_path / "run.hilcal", "nothing", poses=6, then=("identify",))
 
 
 @pytest.fixture(scope="module")
@@ -96,19 +89,6 @@ def test_a_pose_without_an_unloaded_reading(good, tmp_path, capsys):
     assert "absolute" in line
     d = ok(capsys, "identify", path, "--json").document
     assert d["readings"] == "absolute"  # deflections are not possible, so they are not the default
-
-
-@pytest.mark.long
-def test_an_output_replaces_the_one_before(campaign, capsys, monkeypatch):
-    monkeypatch.chdir(campaign.parent)
-    ok(capsys, "identify", campaign)
-    text = re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text())
-    Path("cell.toml").write_text(text, encoding="utf-8")
-    Path("page").touch()  # empty
-    for _ in range(2):
-        ok(capsys, "report", campaign, "-o", "page")
-        ok(capsys, "view", campaign, "--record", "r")
-        ok(capsys, "plan", "cell.toml", "-o", "p", "--csv", "c", "--poses", "6", "--quick")
 
 
 def test_fewer_readings_than_parameters(tmp_path, capsys):

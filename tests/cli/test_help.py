@@ -240,14 +240,6 @@ def test_the_words_of_a_campaign_stay_whole(readings, home, capsys, pages):
 
 
 @pytest.mark.long
-def test_the_words_of_lists_and_plans_stay_whole(home, capsys, pages):
-    Path("cell.toml").write_text(TOML, encoding="utf-8")
-    ok(capsys, "effects")
-    ok(capsys, "plan", "cell.toml", "-o", "plan.json")
-    whole(pages)
-
-
-@pytest.mark.long
 def test_what_commands_print_unasked_is_one_screen(readings, home, capsys, pages):
     run, many = (
         "run.hilcal",

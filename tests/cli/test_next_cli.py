@@ -1,33 +1,19 @@
 """`next`, a further plan in the same campaign, and `demo --ambiguous`."""
 
 import re
-import shlex
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from hilcal.cli import demo
-from hilcal.cli.simulating import RehearsalSettings
 from hilcal.config import load_config
-from hilcal.diagnosis.diagnosis import History, in_doubt
-from hilcal.diagnosis.evidence import Evidence
-from hilcal.diagnosis.verdict import judge
-from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE
-from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
-from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
 from hilcal.store.run_log import RunLog, create_run
-from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import CELL, imported, ok, refused, stored_readings
+from tests.support.cli_cases import imported, ok, refused, stored_readings
 from tests.support.next_cases import SMALL, doubtful, fine_error
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 
@@ -181,37 +167,6 @@ def test_the_demo_settles_a_doubt(tmp_path, capsys):
     assert viewed["revisions"] == [2, 3]
 
 
-def rehearsal_of(seed, path):
-    known = installed()
-    return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, known, known)
-
-
-def in_doubt_at_first(seed, path):
-    """Whether the first readings of an ambiguous demo, which the seed determines, leave a doubt."""
-    case, plan, doubtful = demo.doubtful_case(rehearsal_of(seed, path), None, print)
-    assert doubtful
-    assert case.choice in HARD_TO_SEPARATE
-    secret = case_of_plan(case.config, plan, case.choice, case.seed)
-    r = simulate_plan(secret, plan, [case.seed, 1])  # as `in_process` draws them
-    d = judge(Evidence(fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)), History())
-    return d.verdict == "ambiguous" and case.choice in in_doubt(d)
-
-
-@pytest.mark.slow
-def test_every_ambiguous_demo_is_in_doubt(tmp_path):
-    assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
-
-
-@pytest.mark.long
-def test_a_case_without_a_doubt_is_told(tmp_path, monkeypatch):
-    """An effect that everything separates is hidden all the same, if that is asked for."""
-    monkeypatch.setattr(demo, "MAX_ARMS", 2)
-    monkeypatch.setattr(demo, "_resembled", lambda r, case: False)
-    case, _, doubtful = demo.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
-    assert case.choice == "creep"
-    assert not doubtful
-
-
 __all__ = ["site"]
 
 
@@ -332,18 +287,6 @@ def test_a_further_plan_is_measured_into_the_campaign(site, capsys):
     assert fitted["n_readings"] == len(readings)
     again = ok(capsys, *site.command("--resume", "--json")).document  # nothing is missing
     assert again["readings"] == len(readings)
-
-
-@pytest.mark.long
-def test_the_line_that_next_prints(site, capsys):
-    """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
-    ok(capsys, *site.command(*site.fresh))
-    site.bench.world.restart()
-    path, further = site.directory / "run.hilcal", further_plan(site)
-    planned: Any = SimpleNamespace(path=path, planned=(None, further))
-    line = WorkbenchSession.run_line(planned)
-    named = line.replace("CELL.toml", str(site.directory / "cell.toml"))
-    assert ok(capsys, *shlex.split(named)[1:]).code == 0
 
 
 @pytest.mark.long

@@ -194,6 +194,23 @@ def test_a_rewritten_program_goes_to_its_new_waypoints(sim):
     reached(sim, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
 
 
+def test_dashboard_answers(sim):
+    with Lines(sim.host) as dashboard:
+        assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
+        assert dashboard.ask("PolyscopeVersion").startswith("URSoftware 5.11.6.1010327 ")
+        assert dashboard.ask("get robot model") == "UR10e"
+        assert dashboard.ask("get serial number").isdigit()
+        assert dashboard.ask("robotmode") == "Robotmode: RUNNING"
+        assert dashboard.ask("safetystatus") == "Safetystatus: NORMAL"
+        assert dashboard.ask("running") == "Program running: false"
+        assert dashboard.ask("programState").split()[0] == "STOPPED"
+        assert dashboard.ask("play") == "Failed to execute: play"
+        assert dashboard.ask("close safety popup") == "closing safety popup"
+        assert dashboard.ask("dance") == "could not understand: 'dance'"
+        assert dashboard.ask("quit") == "Disconnected"
+        assert dashboard.read() == ""
+
+
 def test_the_truth_is_what_the_sensors_tell(tmp_path):
     rng = np.random.default_rng(4)
     truth = {

@@ -289,22 +289,3 @@ def test_the_covariance_follows_from_the_fitted_states(effect, mode):
     states = fresh(3)
     a, b = (x.predict(states.q, states.wrench) for x in (c, again))
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_a_thousand_parameters_are_a_small_file(tmp_path):
-    made = campaign("transmission_error", "absolute", 0, poses=POSES, harmonics=20)
-    model = baseline(made.cell, made.readings, "absolute")
-    options = {"harmonics": 100}
-    effect = model.catalogue.make("transmission_error", made.cell, made.readings.states, options)
-    c = Calibration.of(fit(model + effect, made.readings, "absolute"))
-    assert len(c.theta) > 1000
-    path = tmp_path / "c.json"
-    c.save(path)
-    assert path.stat().st_size < 0.5e6
-    again, states = Calibration.load(path), fresh(2)
-    a, b = (x.predict(states.q, states.wrench) for x in (c, again))
-    np.testing.assert_array_equal(a.position, b.position)
-    np.testing.assert_allclose(a.std_m, b.std_m, rtol=5e-3)
-    again.save(tmp_path / "again.json")
-    assert (tmp_path / "again.json").stat().st_size == pytest.approx(path.stat().st_size, rel=0.01)

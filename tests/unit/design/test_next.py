@@ -20,7 +20,7 @@ from hilcal.design.discriminated_pairs import (
     supported_parameters,
 )
 from hilcal.design.information import problem
-from hilcal.design.next import DRAWS, plan_poses, plan_separating
+from hilcal.design.next import DRAWS, plan_separating
 from hilcal.design.nominal_model import model_after
 from hilcal.design.planner import PlanRequest
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
@@ -32,10 +32,8 @@ from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import projection, schur_complement
-from hilcal.store.plan import REFERENCE, UNLOADED
 from tests.support.campaigns import (
     campaign,
-    configuration,
     measured,
     noiseless,
     plan,
@@ -235,22 +233,6 @@ def fine_error():
     waves *= np.sqrt(size / np.sum(waves**2))
     world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
     return replace(c, world=world), measured(world, plan(30, 0), np.random.default_rng(0))
-
-
-@pytest.mark.long
-def test_each_pose_is_a_new_one_and_read_unloaded():
-    c, before = fine_error()
-    first = fitted_model(c.cell, before, "absolute")
-    made = plan_poses(
-        c.cell.with_config(configuration()), first, 12, np.random.default_rng(1)
-    ).ordered.plan
-    assert len({s.pose for s in made.steps} - {REFERENCE}) == 12
-    assert {s.load for s in made.steps} == {UNLOADED}
-    assert len(np.unique(np.round(np.concatenate([made.q, before.states.q]), 6), axis=0)) == 13 + 30
-    home = made.joints(REFERENCE) + 0.0
-    again = plan_poses(c.cell.with_config(configuration()), first, 12, np.random.default_rng(2),
-                          reference=home).ordered.plan  # fmt: skip
-    np.testing.assert_array_equal(again.joints(REFERENCE), home)
 
 
 def test_the_chance_of_telling_it_from_a_rival_grows():

@@ -26,7 +26,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.route import dry_run
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
@@ -92,15 +92,6 @@ def test_every_criterion_gives_a_certified_plan(criterion):
     assert made.criterion == criterion
     assert 0.5 < made.design.efficiency <= 1.0
     assert made.ordered.plan.steps
-
-
-@pytest.mark.long
-def test_absolute_readings_are_planned_one_by_one():
-    made = planned(small(readings="absolute"), readings=25)
-    assert all(len(loads) == 1 for _, loads in made.problem.contents)
-    assert made.counts.sum() == made.budget
-    config = small(readings="absolute")
-    assert dry_run(cell_from_config(config), made.ordered.plan).problems == ()
 
 
 @pytest.mark.long
@@ -342,16 +333,6 @@ def test_a_goal_must_fit_the_model():
         parse_goal("j9 std < 1 %").check(UNITS)
     with pytest.raises(InputError, match="work_q_rad"):
         parse_goal("position std < 1 mm").status(STDS, VALUES)
-
-
-@pytest.mark.long
-def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual):
-    config = small()
-    cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
-    rng = np.random.default_rng(8)
-    made = plan_readings(cell, PlanRequest(5), rng, reference=reference).ordered.plan
-    np.testing.assert_array_equal(made.joints(REFERENCE), reference)
-    assert dry_run(cell, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
 
 @pytest.mark.long
