@@ -121,14 +121,6 @@ def test_an_absent_viewer_is_named(site):
     assert done.stdout.startswith("the viewer: the package rerun is not installed: pip install")
 
 
-def test_a_diagnosis_as_a_dictionary_is_what_the_command_prints(site):
-    with hc.Campaign.open(site.run) as run:
-        d = hc.diagnose(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
-    told = d.to_dict()
-    assert told["verdict"] == d.verdict
-    assert str(told["message"]).startswith(d.suspects[0].effect)
-
-
 def test_an_unknown_name_is_an_attribute_error_and_none_is_a_package_too():
     with pytest.raises(AttributeError, match=r"no attribute 'fitt'; valid: .*, fit, "):
         hc.fitt  # noqa: B018

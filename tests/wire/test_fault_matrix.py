@@ -240,7 +240,6 @@ PERSON_REST = (
 )
 
 
-MORE_READINGS = 8 + len(OVERCOME["tracker"])
 NOT_FAST = tuple(replace(fault, fast=False) for fault in FORCE)
 
 

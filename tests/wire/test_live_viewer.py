@@ -26,7 +26,6 @@ from tests.support.timing import wait_until
 
 pytestmark = pytest.mark.slow
 
-MORE_READINGS = 12
 URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
 LONG = 120.0
 

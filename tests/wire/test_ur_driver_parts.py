@@ -16,7 +16,6 @@ from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
-from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
@@ -33,7 +32,6 @@ from hilcal.drivers.ur_link.reading import (
 from hilcal.drivers.ur_link.supervision import RobotApi
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.identification.torques import check_torques
-from hilcal.measuring.route import duration
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import nominal_rows
 from hilcal.store.campaign_file import CampaignFile
@@ -49,18 +47,6 @@ FIELDS = {
     **{"speed_scaling": 0.5, "target_speed_fraction": 0.5, "payload": 1.0},
     "payload_cog": [0.0, 0.0, 0.1],
 }
-
-
-@given(
-    distance=st.floats(1e-4, 6.0), speed=st.floats(0.01, 3.0), acceleration=st.floats(0.01, 40.0)
-)
-def test_time_of_a_motion_is_that_of_the_simulated_controller(distance, speed, acceleration):
-    goal = np.zeros(N)
-    goal[3] = -distance
-    segment = line(np.zeros(N), goal, speed, acceleration)
-    assert duration(np.zeros(N), goal, speed, acceleration) == pytest.approx(
-        segment.duration, rel=1e-9
-    )
 
 
 @given(speed=st.floats(0.01, 2.0))

@@ -34,7 +34,6 @@ from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import projection, schur_complement
 from tests.support.campaigns import (
     campaign,
-    measured,
     noiseless,
     plan,
     true_parameters,
@@ -222,17 +221,6 @@ def test_most_doubts_are_settled(effect):
 
 
 FINE = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
-
-
-def fine_error():
-    """Thirty poses with a transmission error of harmonics 3 to 21 at 2 σ."""
-    c = campaign("transmission_error", "absolute", 0, **FINE)
-    waves = c.world.physics.transmission_error.copy()
-    size = np.sum(waves**2)
-    waves[:, :2] = 0.0
-    waves *= np.sqrt(size / np.sum(waves**2))
-    world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
-    return replace(c, world=world), measured(world, plan(30, 0), np.random.default_rng(0))
 
 
 def test_the_chance_of_telling_it_from_a_rival_grows():

@@ -101,14 +101,6 @@ def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
     assert "Nothing" in axes[3][0]
 
 
-def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
-    left, _, height = bars(recording, "/follows/mean", 0)
-    assert 4 <= len(left) <= 12
-    assert np.all(np.diff(left) > 0)
-    follows = told.revisions[0].dependence
-    assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
-
-
 def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(recording, by_revision):
     read = by_revision("/words/verdict", "TextDocument:text")
     heads = [read[k][0].splitlines()[0] for k in range(4)]
@@ -129,20 +121,6 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(reco
         "revision",
         "pose",
     }
-
-
-def test_the_leader_of_the_worst_reading_is_no_arrow(told, by_revision):
-    strips = by_revision("/world/residual/leader", "LineStrips3D:strips")
-    balls, _ = campaign.noise_balls(told, np.arange(len(told)))
-    for r in told.revisions:
-        worst = int(np.argmax(r.whitened_norm2))
-        dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
-        assert len(dots) >= 5  # dotted
-        np.testing.assert_allclose(dots[:, :, :2], 0.0, atol=1e-6)
-        assert dots[:, :, 2].min() > min(balls[worst].max(), 0.25)  # begins outside of the ball
-        gaps = dots[1:, 0, 2] - dots[:-1, 1, 2]
-        assert (gaps > np.ptp(dots[:, :, 2], axis=1)[:-1]).all()
-    assert tuple(style.LEADER) not in {tuple(c) for c in style.LEVEL_COLORS.tolist()}
 
 
 def test_bars_hold_every_pose_once_and_the_tallest_is_the_worst_reading(told, by_revision):
@@ -265,28 +243,8 @@ def test_a_rail_is_drawn_along_its_travel():
 # pictures
 
 
-def share_of_red(png):
-    """Share of pixels in the colour of a reading that the model fails."""
-    return float((np.abs(png[..., :3].astype(int) - style.RED).max(axis=2) < 40).mean())
-
-
 def colors(png):
     return len(np.unique(png.reshape(-1, png.shape[2]), axis=0))
-
-
-@pytest.mark.long
-@pytest.mark.vulkan
-@needs_vulkan
-def test_the_picture_shows_the_red_vanish(told, recording, tmp_path):
-    reached = [levels(r.whitened_norm2).max() for r in told.revisions]
-    assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
-    shots = [Shot(tmp_path / f"{k}.png", "revision", k, campaign.titles(told)[0]) for k in (0, 3)]
-    reports = pictures(recording, shots, SIZE, LONGEST)
-    assert len(reports) >= 10
-    assert [v for v in reports if v.problems] == []
-    first, last = (pixels(s.png) for s in shots)
-    assert colors(first) > 500
-    assert share_of_red(first) > 0 == share_of_red(last)
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from hilcal.present.viewer.plan import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView, 
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from tests.support.picture import Shot, needs_vulkan, pictures
-from tests.support.recordings import entities, rows, same, texts
+from tests.support.recordings import entities, rows, texts
 from tests.support.refusals import refusal
 from tests.support.viewer_plan import (
     BARE,
@@ -246,14 +246,6 @@ def test_the_suspects_and_their_powers_come_before_the_plan(tmp_path):
     assert "| joint_tilt_compliance | link_compliance | 74 % | 98 % |" in lines[1:6]
     assert "| link_compliance | joint_tilt_compliance | 56 % | not in this cell |" in lines[1:6]
     assert any(line.startswith("### Plan: 3 poses") for line in lines[5:])
-
-
-def test_equal_plans_give_equal_recordings(shadowed, recording, tmp_path):
-    again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
-    record_plan(shadowed, PLAN, SUMMARY, again)
-    record_plan(shadowed, replace(PLAN, steps=PLAN.steps[:-1]), SUMMARY, other)
-    assert same(recording, again)
-    assert not same(recording, other)
 
 
 def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from studies.diagnosis import (
     AddedEffect,
@@ -18,7 +17,6 @@ from studies.diagnosis import (
     run_case,
 )
 from studies.diagnosis_claims import claims
-from studies.diagnosis_pool import run_all
 from studies.diagnosis_rates import (
     afterwards,
     by_effect,
@@ -29,11 +27,9 @@ from studies.diagnosis_rates import (
 )
 from studies.diagnosis_table import report
 from studies.study_cases import study_case
-from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import refused
-from tests.support.fit_cases import fitted_model
 from tests.support.refusals import check, refusal, refusals
 
 
@@ -59,13 +55,6 @@ def refined(*added, same_as=(), verdict="adequate", holdout=1.0, inside=()):
 def outcome(lead="creep", *same_as, **given):
     """The answer that `lead` is first, to a question about creep."""
     return DiagnosisOutcome(asked(**given), said(lead, *same_as))
-
-
-def quick(question):
-    """An answer without any work; by module and name, so that other processes find it."""
-    if question.seed < 0:
-        raise RuntimeError("a seed below 0")
-    return DiagnosisOutcome(question, said(f"effect {question.seed}"))
 
 
 @pytest.mark.parametrize(
@@ -162,22 +151,6 @@ def test_a_case_that_fails_is_a_miss_that_says_why_and_one_that_cannot_be_does_n
     assert "1 campaigns cannot be" in written([outcome(), o])
 
 
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_ctrl_c_leaves_what_there_is(jobs):
-    every = tuple(asked(seed=s) for s in range(200))
-    done = []
-
-    def interrupted(step):
-        done.append(step)
-        if len(done) == 5:
-            raise KeyboardInterrupt
-
-    outcomes, complete = run_all(every, quick, jobs, interrupted)
-    assert not complete
-    assert len(outcomes) == 5
-    assert all(o.case in every for o in outcomes)
-
-
 def written(outcomes):
     out = Console(file=io.StringIO(), width=100)
     for part in report(outcomes):
@@ -245,14 +218,3 @@ def test_laws_and_effects_that_do_not_fit_are_refused():
         shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="changes nothing"):
         shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
-
-
-def diagnosed(c):
-    return diagnose(fitted_model(c.cell, c.readings, "deflection"))
-
-
-def test_nothing_is_measured_where_one_effect_leads_alone():
-    c = case("hysteresis", mode="deflection", strength=3.0, poses=20)
-    d = diagnosed(c)
-    assert suspects(d) == ("hysteresis",)
-    assert measure_more(configuration(), "ur10e", c, d, seed=1) is None
