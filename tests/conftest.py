@@ -68,7 +68,7 @@ def pytest_configure(config: pytest.Config) -> None:
 FIRST = (
     "test_stops", "test_fault_matrix",
     "test_run", "test_force_drivers", "test_library", "test_effect_jacobian", "test_run_faults",
-    "test_run_watched", "test_ur_driver_faults", "test_ur_driver", "test_devices",
+    "test_run_watched", "test_ur_driver_faults", "test_ur_driver",
     "test_gross_errors", "test_diagnose", "test_planner", "test_geocom_driver", "test_next_cli",
     "test_simulated_cell", "test_workbench_page", "test_arm_scatter", "test_background",
     "test_natnet_driver", "test_registration", "test_network_cell",

@@ -21,6 +21,7 @@ from hilcal.measuring.connect import connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.measure import average
 from hilcal.robot.catalogue import configs_dir
+from tests.support.rows import first
 from tests.support.spread_plan import spread_plan
 from tests.unit.robot.test_rails import TRACK
 
@@ -29,15 +30,18 @@ SLOW = 0.2  # rad/s
 PATIENCE = 60.0  # s
 
 
-@pytest.fixture(
-    scope="module", params=["ur10e", pytest.param("track.toml", marks=pytest.mark.long)]
-)
+def pytest_generate_tests(metafunc):
+    """The real cell that is named; else a simulated UR and an arm on a track."""
+    if "there" in metafunc.fixturenames:
+        given = metafunc.config.getoption("--hardware")
+        cells = [given] if given else first(0, ["ur10e", "track.toml"])
+        metafunc.parametrize("there", cells, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
 def there(request, tmp_path_factory):
-    """The cell: a real one where it is named, else a simulated one, of UR or on a track."""
-    given = request.config.getoption("--hardware")
-    if given is not None and request.param != "ur10e":
-        pytest.skip("simulated arms of other makers")
-    if given is not None:
+    """The configuration and the cell."""
+    if given := request.config.getoption("--hardware"):
         config = load_config(Path(given))
         yield config, cell_from_config(config, Path(given).absolute().parent)
         return
