@@ -17,7 +17,6 @@ from hilcal.present.story import build_story
 from hilcal.present.verdict import message
 from hilcal.store.campaign_file import CampaignFile
 from studies.diagnosis import judgement
-from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, stored_readings
 from tests.support.next_cases import SMALL, doubtful
@@ -286,11 +285,6 @@ def study(mode, *hidden, seed=1, **options):
     return UR5E, c.readings
 
 
-def correlated():
-    c = study_case(UR5E, "ur5e", "absolute", (), 1.0, 3, n_poses=12)
-    return UR5E, serial_readings(c, 0.9, np.random.default_rng(3))
-
-
 def doubtful_at_first():
     return SMALL, doubtful("base_compliance", 2).rehearsal.readings
 
@@ -299,15 +293,12 @@ LOADS, POSITIONS = "deflection", "absolute"
 CASES = {
     "missing": (LOADS, "missing_effect", lambda: study(LOADS, "creep", n_poses=12)),
     "ambiguous": (POSITIONS, "ambiguous", doubtful_at_first),
-    "unknown": (POSITIONS, "unknown_effect", lambda: study(POSITIONS, "swaying bench")),
     "unknown although tried": (
         LOADS,
         "unknown_effect",
         lambda: study(LOADS, "relaxing bench", n_poses=12),
     ),
-    "adequate": (LOADS, "adequate", lambda: study(LOADS)),
     "noise": (LOADS, "noise_misjudged", lambda: study(LOADS, stated=0.5, cycles=2)),
-    "correlated": (POSITIONS, "adequate", correlated),
 }
 """By case: kind of readings, the verdict on the baseline, and what makes cell and readings."""
 

@@ -52,6 +52,7 @@ def test_a_fault_while_the_arm_rests(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=False)
 
 
+@pytest.mark.long
 def test_faults_that_are_overcome_cost_nothing(cell, path):
     """A lock and zeros that are lost, axes of an object, lost records."""
     run, _ = cases.start_run(cell, path, cases.Run.measuring)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 import hilcal as hc
 from hilcal.campaign.campaign import estimated_noise
-from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.arm import open_arm
@@ -18,7 +17,6 @@ from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.connect import connect
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import flange_difference, of_dict, read_factory, with_factory
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
@@ -81,24 +79,6 @@ def test_the_noise_of_cameras_is_estimated_and_not_believed(tmp_path, capsys):
 
 
 FR3 = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.8, 0.5])
-
-
-EIGHT = "\n".join(
-    [
-        'title = "Eight joints, two of them slides"\nconvention = "modified"\n',
-        *(
-            f'[[joints]]\nname = "{name}"\na_m = {a}\nd_m = {d}\nalpha_deg = {alpha}\n{more}\n'
-            for name, a, d, alpha, more in (
-                ("track", 0.0, 0.0, 90.0, 'type = "prismatic"\nq_min_m = 0.0\nq_max_m = 2.0'),
-                ("lift", 0.0, 0.4, -90.0, 'type = "prismatic"\nq_min_m = 0.0\nq_max_m = 0.6'),
-                *((f"j{k}", *row, "q_min_deg = -170\nq_max_deg = 170\nmass_kg = 2.0")
-                  for k, row in enumerate(((0.0, 0.3, 0.0), (0.05, 0.0, -90.0), (0.4, 0.0, 0.0),
-                                           (0.05, 0.4, -90.0), (0.0, 0.0, 90.0),
-                                           (0.0, 0.1, -90.0)), start=1)),
-            )
-        ),
-    ]
-)  # fmt: skip
 
 
 def config_of(model, **simulation):
@@ -167,36 +147,6 @@ def test_the_simulated_arm_keeps_the_rules_of_a_real_one(fr3):
     fr3.restart("arm")
     np.testing.assert_allclose(arm.sample().q, stood, atol=1e-3)
     arm.close()
-
-
-@pytest.mark.long
-def test_eight_joints_with_two_slides_stand_where_their_kinematics_say(tmp_path):
-    (tmp_path / "eight.toml").write_text(EIGHT)
-    config = config_of("eight.toml")
-    q = np.array([1.2, 0.3, 0.4, -1.0, 0.6, 0.2, 1.0, -0.5])
-    secret = case_of(config, q, tmp_path)
-    with simulated_cell(secret, 1, tmp_path) as cell:
-        rig, answers = connect(cell.config)
-        assert rig is not None, [answer.failure for answer in answers]
-        try:
-            rig.arm.take_control(0.0, np.zeros(3))
-            goal = q + np.array([0.5, 0.2, *[0.3] * 6])
-            rig.arm.start_move(goal, 0.5, 0.8)
-            while rig.arm.moving():
-                time.sleep(0.01)
-            sample = rig.arm.sample()
-            np.testing.assert_allclose(sample.q, goal, atol=1e-4)
-            time.sleep(0.3)
-            seen = rig.tracker.measure().value
-        finally:
-            rig.close()
-    truth = secret.world
-    arm = cell_from_config(config, tmp_path).arm
-    chain = evaluate(arm, goal[None])
-    point = chain.point(np.array([0.06, 0.02, 0.12]))[0]
-    expected = truth.registration[:3, :3] @ point + truth.registration[:3, 3]
-    # what the drives give way under the arm's weight, and the noise of the tracker
-    assert np.linalg.norm(seen[:3] - expected) < 5e-3
 
 
 ROBOT = {"model": "ur15", "kinematics": "factory", "calibration": "cal.toml"}

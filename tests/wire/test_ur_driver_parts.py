@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.config.reference import to_toml
-from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
+from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import open_arm
@@ -31,14 +30,10 @@ from hilcal.drivers.ur_link.reading import (
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
-from hilcal.identification.torques import check_torques
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import nominal_rows
-from hilcal.store.campaign_file import CampaignFile
 from tests.support import ur_driver_cases as cases
-from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
-from tests.support.running_world import config, world_of
 from tests.support.ur_driver_cases import server
 
 FIELDS = {
@@ -192,35 +187,6 @@ def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path):
         assert time.monotonic() - begun < 5.0
         assert arm.sample().torque is None
         assert len(arm.workers) == 1
-
-
-@pytest.mark.long
-def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys):
-    """The weights are half as heavy as the cell says; friction is taken by the side of arrival."""
-    simulation = {"clock": 40.0, "controller_version": "10.11.0.0", "seed": 4}
-    load = [{"name": "10kg", "mass_kg": 10.0}]
-    parts = config(simulation=simulation, planning={"candidates": 150}, loads=load)
-    true = config(simulation=simulation, loads=[{"name": "10kg", "mass_kg": 5.0}])
-    toml, plan, run = (tmp_path / n for n in ("cell.toml", "plan.json", "run.hilcal"))
-    with SimulatedCell.start(world_of(true), true, tmp_path / "cell", 3) as cell:
-        told = cell.config.model_copy(update={"loads": parts.loads, "planning": parts.planning})
-        toml.write_text(to_toml(told))
-        ok(capsys, "plan", toml, "-o", plan, "--poses", "6")
-        ok(capsys, "run", toml, "--plan", plan, "-o", run)
-    with CampaignFile.open(run, read_only=True) as campaign:
-        readings = campaign.readings()
-    assert readings.states.torque is not None
-    assert np.isfinite(readings.states.torque).all()
-    made = world_of(true).cell
-    found = check_torques(made, readings)
-    assert found is not None
-    (weight,) = (f for f in found.factors if f.of == "10kg")
-    # the interval holds neither friction that is left nor the sag of the arm: a per cent
-    assert weight.factor == pytest.approx(0.5, rel=0.01)
-    assert weight.differs
-    words = " ".join(ok(capsys, "info", run).out.split())
-    assert "load 10kg is" in words
-    assert "kg, not 10 (95 %" in words
 
 
 JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s"

@@ -262,7 +262,7 @@ def test_more_than_can_be_told_is_said(mode):
 )  # fmt: skip
 def test_readings_that_follow_the_state_are_not_called_wrong(kind, size, angle, every):
     """A law of one angle, which every reading of a pose has in common."""
-    r = C.readings if every else C.readings[C.readings.unloaded]
+    r = C.readings[C.readings.pose < 20] if every else C.readings[C.readings.unloaded]
     value = r.value.copy()
     value[:, 1] += size * angle(r.states.q)
     found = fitted_model(C.cell, replace(r, value=value), "absolute")
