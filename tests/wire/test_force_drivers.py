@@ -346,14 +346,6 @@ def test_ft300_serves_a_modbus_library_that_no_driver_uses():
             client.close()
 
 
-def test_each_sensor_has_a_zero_of_its_own():
-    biases = []
-    for seed in (1, 1, 2):
-        with force_sensor("ft300", seed=seed) as sensor:
-            biases.append(sensor.admin("state")["bias"])
-    assert biases[0] == biases[1] != biases[2]
-
-
 def test_the_zero_drifts_as_the_sensor_warms_up():
     with (
         force_sensor("bota", "--on", "0", scale=2000.0) as sensor,
