@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 import tty
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,40 +108,25 @@ def test_an_unplugged_adapter_is_one_line_whatever_was_tried(line, action):
         close_port(port)
 
 
-def test_a_line_is_drained_until_quiet(line):
-    port = open_port("tracker", str(line.path), 19200)
-    sent = threading.Event()
-
-    def talk():
-        for _ in range(10):
-            os.write(line.master, b"late answer\r\n")
-            time.sleep(0.01)
-        sent.set()
-
-    thread = threading.Thread(target=talk)
-    try:
-        thread.start()
-        assert drain(port, quiet=0.3, limit=20.0)
-        assert sent.is_set()
-        assert port.in_waiting == 0
-    finally:
-        thread.join()
-        close_port(port)
-
-
-def test_a_line_that_never_is_quiet_is_told_of(line):
+@pytest.mark.parametrize(("words", "limit"), [(10, 20.0), (10**9, 1.0)])
+def test_a_line_is_drained_until_quiet_or_told_of(line, words, limit):
     port = open_port("tracker", str(line.path), 19200)
     stop = threading.Event()
 
     def talk():
-        while not stop.is_set():
-            os.write(line.master, b"x")
-            time.sleep(0.002)
+        for _ in range(words):
+            if stop.wait(0.005):
+                return
+            os.write(line.master, b"late\r\n")
 
     thread = threading.Thread(target=talk)
     try:
         thread.start()
-        assert not drain(port, quiet=0.5, limit=1.0)
+        drained = drain(port, quiet=0.3, limit=limit)
+        assert drained is (words == 10)
+        if drained:
+            assert not thread.is_alive()
+            assert port.in_waiting == 0
     finally:
         stop.set()
         thread.join()
