@@ -204,6 +204,7 @@ def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
     assert sim.admin()["payload"] == cases.MASS
 
 
+@pytest.mark.long
 def test_motion_in_a_world_that_goes_faster(tmp_path):
     with (
         closing(cases.start(tmp_path, scale=20.0)) as running,

@@ -117,13 +117,15 @@ def test_a_safeguard_stop_at_rest_is_told_with_what_to_do(arm, sim):
     arm.take_control(cases.MASS, cases.COM)
 
 
-def test_a_cell_that_always_works_in_reduced_mode_is_driven(tmp_path):
-    with closing(cases.start(tmp_path)) as running:
-        running.admin("reduced_mode")
-        with closing(cases.controlled(running, reduced_mode=True)) as arm:
+def test_a_cell_that_always_works_in_reduced_mode_is_driven(sim):
+    sim.admin("reduced_mode")
+    try:
+        with closing(cases.controlled(sim, reduced_mode=True)) as arm:
             assert not arm.report().problems
             arm.start_move(cases.displaced_joints(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
             cases.finish(arm)
+    finally:
+        sim.admin("reduced_mode", on=False)
 
 
 def test_an_arm_in_reduced_mode_is_stopped_and_goes_on_after_it(arm, sim):
