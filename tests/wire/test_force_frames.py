@@ -1,6 +1,5 @@
 """Frames of force sensors out of damaged streams, and the count of what was lost."""
 
-import binascii
 import struct
 
 import numpy as np
@@ -10,7 +9,6 @@ from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer
-from hilcal.drivers.links import crc_x25
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,
@@ -42,18 +40,6 @@ def damaged(frames, rng, most_bits):
         out.append(bytes(data))
         whole.append(bytes(data) == frame)
     return out, np.array(whole)
-
-
-@given(data=st.binary(max_size=60))
-def test_x25_is_the_mirror_image_of_the_standard_library_s_ccitt(data):
-    def mirror(value, bits):
-        return int(f"{value:0{bits}b}"[::-1], 2)
-
-    mirrored = bytes(mirror(byte, 8) for byte in data)
-    assert (
-        int.from_bytes(crc_x25(data), "little")
-        == mirror(binascii.crc_hqx(mirrored, 0xFFFF), 16) ^ 0xFFFF
-    )
 
 
 @ALL
