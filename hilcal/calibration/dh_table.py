@@ -89,7 +89,20 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     offset[np.abs(offset) < 1e-15] = 0.0  # rounding errors
     slides = tuple(np.flatnonzero(arm.slides).tolist())
     rows = DhRows(convention, a, along[:, 1], alpha, offset, base, flange, slides=slides)
-    return _with_motions(rows, arm)
+    q = np.random.default_rng(20250309).uniform(-np.pi, np.pi, (TRIALS, n))
+    chain, by_rows = evaluate(arm, q), flange_poses(rows, q, whole=False)
+
+    def moves(poses: Floats) -> float:
+        """Return the largest distance of the flange from that of the arm, m."""
+        return float(np.linalg.norm(poses[:, :3, 3] - chain.position[-1], axis=1).max())
+
+    return replace(
+        rows,
+        base_moves=moves(by_rows @ flange),
+        flange_moves=moves(base @ by_rows),
+        table_moves=moves(by_rows),
+        disagreement=moves(base @ by_rows @ flange),
+    )
 
 
 def row_transforms(rows: DhRows, q: Floats) -> Floats:
@@ -162,25 +175,6 @@ def _ranges(arm: Arm, k: int) -> dict[str, object]:
         return out | ({"force_max_N": torque} if np.isfinite(torque) else {})
     out = {"q_min_deg": float(np.degrees(low)), "q_max_deg": float(np.degrees(high))}
     return out | ({"torque_max_Nm": torque} if np.isfinite(torque) else {})
-
-
-def _with_motions(rows: DhRows, arm: Arm) -> DhRows:
-    """Return the rows with the motions of the flange without B and E, at random joint values."""
-    q = np.random.default_rng(20250309).uniform(-np.pi, np.pi, (TRIALS, arm.n))
-    chain = evaluate(arm, q)
-    flange = se3.matrix(chain.rotation[-1], chain.position[-1])
-    by_rows = flange_poses(rows, q, whole=False)
-
-    def largest_motion(poses: Floats) -> float:
-        return float(np.linalg.norm((poses - flange)[:, :3, 3], axis=1).max())
-
-    return replace(
-        rows,
-        base_moves=largest_motion(by_rows @ rows.flange),
-        flange_moves=largest_motion(rows.base @ by_rows),
-        table_moves=largest_motion(by_rows),
-        disagreement=largest_motion(rows.base @ by_rows @ rows.flange),
-    )
 
 
 def _centres(rows: DhRows, arm: Arm) -> Floats:

@@ -151,17 +151,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     return np.stack(out)
 
 
-def stated_twice(points: Points, arm: Arm, tool: Floats) -> Floats:
-    """Return the distances (N,) of stated poses from the nominal tool (4, 4) at stated joints, m.
-
-    The pose is the target, and the joint values only select the branch; NaN where one is lacking.
-    """
-    if points.target_poses is None:
-        return np.full(len(points.q), np.nan)
-    at_joints = nominal_pose(arm, tool, points.q)[1]
-    return np.asarray(np.linalg.norm(points.target_poses[:, :3, 3] - at_joints, axis=1))
-
-
 def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floats:
     """Return joint values (K, n) at which the nominal arm has the tool (4, 4) at a pose (4, 4).
 

@@ -278,15 +278,10 @@ class CalibrationOperator:
     simulated: CellConfig | None = None  # of simulated devices, once they run
     ready: bool = False  # whether every device has reported that it is ready
 
-    @property
-    def clock(self) -> float:
-        """Clock rate of the cell relative to real time."""
-        return self.p.clock
-
     def run_steps(self) -> None:
         """Do all remaining steps up to the comparison."""
         while (step := self.p.next()).kind not in ("done", "compare"):
-            self.t.show(words.step_heading(step, self.clock))
+            self.t.show(words.step_heading(step, self.p.clock))
             if step.moves:
                 self._moving(step)
             else:
@@ -305,19 +300,18 @@ class CalibrationOperator:
             warning = "The simulated arm will move." if self.rehearse else "The arm will move."
             if not confirmed(self.t, f"Measure now? {warning}"):
                 raise StoppedError("not measured, nothing has moved")
-        config = self._config()
+        cell = self.p.cell.with_config(self._config())
 
         def work(campaign: CampaignFile, epoch: float | None) -> None:
-            measure(
-                self.t, self.p.cell.with_config(config), campaign, epoch=epoch, viewer=self.viewer
-            )
+            measure(self.t, cell, campaign, epoch=epoch, viewer=self.viewer)
+
+        def measured() -> int:
+            return self.p.measure(step, work)
 
         if self.rehearse:
-            retry_after_failures(
-                self.t, lambda: self.p.measure(step, work), lambda: _count(step.path)
-            )
+            retry_after_failures(self.t, measured, lambda: _count(step.path))
         else:
-            self.p.measure(step, work)
+            measured()
 
     def _config(self) -> CellConfig:
         """Return the configuration of the devices; in a rehearsal, start simulated ones."""
@@ -352,7 +346,7 @@ class CalibrationOperator:
             t.show(prior_report(result))
         elif step.kind == "decide":
             settings = p.settings
-            t.show(words.decision_report(result, settings.goal_m, settings.readings, self.clock))
+            t.show(words.decision_report(result, settings.goal_m, settings.readings, p.clock))
         elif step.kind == "validate":
             t.show(words.validation_lines(result))
 

@@ -4,14 +4,14 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import Compensation
-from hilcal.calibration.points import Points, on_branch, read_points, stated_twice
+from hilcal.calibration.compensation import Compensation, nominal_pose
+from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs import urscript
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
 from hilcal.campaign.campaign import Campaign
@@ -158,7 +158,7 @@ def compensate(
         result = calibration.compensate(q, acting, tool=task.tool, wanted=poses)
     document = result.to_dict(task.points.names)
     if outcomes:
-        document["waypoints"] = [asdict(fate) for fate in outcomes]
+        document["waypoints"] = outcomes
     files = [f for path in output or () for f in _write(path, task, result, document, arm.units)]
     written = [str(path) for path in files]
     t.show(compensation_report(calibration, task.points.names, q, result))
@@ -192,7 +192,10 @@ def compensate(
 
 def _two_targets(points: Points, arm: Arm, tool: Floats) -> str:
     """Return how far stated poses are from the tool at stated joint values; "" without both."""
-    far = stated_twice(points, arm, tool)
+    if points.target_poses is None:
+        return ""
+    at_joints = nominal_pose(arm, tool, points.q)[1]  # NaN where joint values are lacking
+    far = np.linalg.norm(points.target_poses[:, :3, 3] - at_joints, axis=1)
     if not np.isfinite(far).any():
         return ""
     k = int(np.nanargmax(far))

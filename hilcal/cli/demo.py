@@ -3,9 +3,10 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,14 +92,12 @@ SECOND_SHARE = 0.8
 as a single one otherwise."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstDiagnosis:
+class FirstDiagnosis(NamedTuple):
     """A first diagnosis, and the plan that would settle it."""
 
-    readings: int
-    record: RevisionRecord | None  # of the diagnosis; None where nothing is in doubt
-    plan: Plan | None  # measurements that separate the suspects; None where nothing is in doubt
     document: dict[str, object]
+    record: RevisionRecord | None = None  # of the diagnosis; None where nothing is in doubt
+    plan: Plan | None = None  # measurements that separate the suspects; None without a doubt
 
 
 def doubtful_case(
@@ -164,7 +163,7 @@ def diagnose_first(
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     suspects = left_open(d)
     if not suspects:
-        return FirstDiagnosis(len(r.readings), None, None, document)
+        return FirstDiagnosis(document)
     t.show(step_report(1, model_name(fitted.model.named), d))
     t.show(heading(f"Ambiguous between {numbers.names(suspects)}: readings that separate them"))
     with working(t.progress) as say:
@@ -178,7 +177,7 @@ def diagnose_first(
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
     record = to_record(fitted, d.to_dict(), None, content_hash(r.readings))
-    return FirstDiagnosis(len(r.readings), record, plan, document)
+    return FirstDiagnosis(document, record, plan)
 
 
 CELL = "demo_ur10e.toml"
@@ -282,7 +281,7 @@ def demo(
         message=message(refinement.diagnosis),
         rejected=list(refinement.rejected),
         revisions=revisions_json(chapters),
-        parameters=[asdict(p) for p in truth],
+        parameters=truth,
         truth=r.world.truth,
         compensation=None
         if improved is None
@@ -328,7 +327,8 @@ def _campaign(
                 case, plan, another = doubtful_case(first, hidden, say, tries - 1)
             else:
                 plan = simulating.first_plan(case, case.config, poses, say)
-        for path in (Files(case.output).validation, Files(case.output).corrected):
+        files = Files(case.output)
+        for path in (files.validation, files.corrected):
             path.unlink(missing_ok=True)
         with measured(t, case, plan) as m:
             if existed and tries == 1:
@@ -339,14 +339,14 @@ def _campaign(
                 yield m, r, None
                 return
             doubt = diagnose_first(t, r, first.seed, plan, poses, case.catalogue)
+            last = doubt.plan is not None or not another or tries == MAX_CAMPAIGNS
             if doubt.plan is not None:
-                r = m.measure_plan(doubt.plan)
-                new = len(r.readings) - doubt.readings
+                before, r = len(r.readings), m.measure_plan(doubt.plan)
+                new = len(r.readings) - before
                 t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
-                yield m, r, doubt
-                return
-            if not another or tries == MAX_CAMPAIGNS:
+            elif last:
                 t.show("These readings separate the suspects; another --seed or --hide may not.\n")
+            if last:
                 yield m, r, doubt
                 return
         t.show("These readings separate the suspects: another arm is measured.\n")

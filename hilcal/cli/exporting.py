@@ -32,9 +32,7 @@ from hilcal.store.stored_texts import ROBOT_FILE
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
-LARGE_OFFSET_M = (
-    10.0  # m; distance along a joint's axis beyond which a note about cancellation is printed
-)
+LARGE_OFFSET_M = 10.0  # distance along a joint's axis above which d of two joints may cancel, m
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,9 +49,8 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     _notice_accepted(t, run, revision)
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
-        t.notice(
-            f"no revision yet: using the baseline {_summary(fitted)}; hilcal identify stores it"
-        )
+        summary = _summary(fitted)
+        t.notice(f"no revision yet: using the baseline {summary}; hilcal identify stores it")
     return number, fitted
 
 
@@ -257,8 +256,23 @@ def identify(
                 f"{run}: the readings of a stream are absolute, and their scaling is gc; leave out "
                 "--scaling, --readings and --fit-validation"
             )
-        count = check_workers(workers, scheduler, effects_from)
-        identify_stream(t, run, cell, named, catalogue, carried, out, count, scheduler)
+        workers = check_workers(workers, scheduler, effects_from)
+        if cell is None:
+            raise InputError(f"{run}: a table has no cell; give --cell CELL.toml as well")
+        robot_cell = Cell.load(cell)
+        tracker = robot_cell.configured().tracker
+        stream = open_stream(run, robot_cell.arm, tracker_noise(tracker), tracker.station_m)
+        with open_engine(workers, scheduler) as engine:
+            progress = partial(counting, t.progress)
+            of_stream = fit_stream(stream, robot_cell, engine, named, catalogue, carried, progress)
+        t.show(stream_report(of_stream))
+        document = stream_json(of_stream)
+        if out is not None:
+            source = {"stream": run.name, "readings": of_stream.readings}
+            calibration_of_stream(of_stream, source).save(out)
+            t.show(f"\n{out}: the calibration, for hilcal compensate and hc.Calibration")
+            document["calibration"] = str(out)
+        t.document(document)
         return
     if any(option is not None for option in (cell, out, workers, scheduler)):
         raise InputError("--cell, -o, --workers and --scheduler are for a stream, READINGS.parquet")
@@ -294,7 +308,7 @@ def identify(
     other_arm = other_arm_of(o.cell, o.readings)
     if other_arm is not None:
         t.show(other_arm_line(other_arm))
-    document: dict[str, object] = {"revision": number, **to_json(stored)}
+    document = {"revision": number, **to_json(stored)}
     document |= {"options": options_json(stored), "covariance": o.covariance_parts}
     document |= {} if torques is None else {"torques": torques.to_json()}
     document["other_arm"] = None if other_arm is None else other_arm.to_json()
@@ -316,36 +330,6 @@ def options_line(fitted: Fit) -> list[str]:
 def options_json(fitted: Fit) -> dict[str, dict[str, object]]:
     """Return all options of the effects, by name."""
     return {e.name: dict(e.options) for e in fitted.model.effects}
-
-
-def identify_stream(
-    t: Terminal,
-    path: Path,
-    cell_path: Path | None,
-    effects: Mapping[str, Options] | None,
-    catalogue: Catalogue,
-    prior: CarriedPrior | None,
-    out: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-) -> None:
-    """Fit a model to a stream, print it, and write its calibration."""
-    if cell_path is None:
-        raise InputError(f"{path}: a table has no cell; give --cell CELL.toml as well")
-    cell = Cell.load(cell_path)
-    config = cell.configured()
-    stream = open_stream(path, cell.arm, tracker_noise(config.tracker), config.tracker.station_m)
-    with open_engine(workers, scheduler) as engine:
-        progress = partial(counting, t.progress)
-        stream_fit = fit_stream(stream, cell, engine, effects, catalogue, prior, progress)
-    t.show(stream_report(stream_fit))
-    document = stream_json(stream_fit)
-    if out is not None:
-        source = {"stream": path.name, "readings": stream_fit.readings}
-        calibration_of_stream(stream_fit, source).save(out)
-        t.show(f"\n{out}: the calibration, for hilcal compensate and hc.Calibration")
-        document["calibration"] = str(out)
-    t.document(document)
 
 
 @command("""

@@ -22,7 +22,6 @@ from hilcal.diagnosis.diagnosis import MOST_IN_DOUBT
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.fit_document import with_nulls
 from hilcal.measuring.connect import ConnectionResult, connect, reported_kinematics, with_kinematics
 from hilcal.measuring.route import DryRun, dry_run
@@ -242,7 +241,17 @@ def next_(
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         changed = None if cell is None else Cell.load(cell)
-        doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
+        named = _named(suspects, catalogue)
+        number, newest = fitting.fit_of(t, o, say, revision)
+        o.require_gc(number, newest.scaling, "next")
+        if carried is not None:
+            say("fitting with the prior")
+            newest = fitting.fitted_with(carried, o, newest)
+        if named is not None:
+            doubt = Doubt(fit_without(newest, named, say), named, None)
+        else:
+            say("diagnosing" if number is None else f"diagnosing revision {number}")
+            doubt = doubt_to_settle(o, diagnose(newest, o.history(number), say), say)
         compare = (details or t.json) and not quick
         planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
         robot_cell = o.cell if changed is None else changed
@@ -271,26 +280,6 @@ def separates(chosen: SeparatingPlan) -> dict[str, object]:
         "difference": chosen.shares,
         "notes": list(chosen.notes),
     }
-
-
-def _without_suspects(
-    t: Terminal,
-    o: Campaign,
-    revision: int | None,
-    named: tuple[str, ...] | None,
-    say: Say,
-    prior: CarriedPrior | None,
-) -> Doubt:
-    """Return the effects to separate, and a fit whose model is without them."""
-    number, newest = fitting.fit_of(t, o, say, revision)
-    o.require_gc(number, newest.scaling, "next")
-    if prior is not None:
-        say("fitting with the prior")
-        newest = fitting.fitted_with(prior, o, newest)
-    if named is not None:
-        return Doubt(fit_without(newest, named, say), named, None)
-    say("diagnosing" if number is None else f"diagnosing revision {number}")
-    return doubt_to_settle(o, diagnose(newest, o.history(number), say), say)
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:

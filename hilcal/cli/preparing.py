@@ -6,7 +6,7 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hilcal
 from hilcal import doctor as machine
@@ -160,24 +160,20 @@ def drivers(group: str) -> list[str]:
     return sorted({point.name for point in entry_points(group=group)})
 
 
-@dataclass(frozen=True, slots=True)
-class CellQuestion:
+NEEDS = {"tracker_port": "tracker", "force_port": "force_sensor", "tool_com": "tool"}
+"""The section without which a question does not arise."""
+
+
+class CellQuestion(NamedTuple):
     """A question about the cell."""
 
     parameter: str  # parameter of the option that answers the question
     text: str
     default: str = ""  # meaning of an empty answer; empty where an answer is needed
 
-    @property
-    def option(self) -> str:
-        """The option that answers the question."""
-        return "--" + self.parameter.replace("_", "-")
 
-    @property
-    def needs(self) -> str:
-        """The section without which the question does not arise; may be empty."""
-        needed = {"tracker_port": "tracker", "force_port": "force_sensor", "tool_com": "tool"}
-        return needed.get(self.parameter, "")
+def _option(parameter: str) -> str:
+    return "--" + parameter.replace("_", "-")
 
 
 def questions() -> list[CellQuestion]:
@@ -240,7 +236,7 @@ def init(
     force: bool = False,
 ) -> None:  # fmt: skip
     """Write a commented CELL.toml from answers at the terminal, or from options."""
-    options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
+    options = dict(locals())
     asks = person_present(t) and not t.json
     check_folder(cell, str(cell))
     check_new(
@@ -250,10 +246,10 @@ def init(
     if asks:
         t.notice(f"Press Enter to skip a question; Ctrl-C stops without writing {cell}.\n")
     for question in questions():
-        stated = options[question.option]
+        stated = options[question.parameter]
         if stated is not None:
             for text in stated if isinstance(stated, list) else [stated]:
-                _from_option(draft, question, text)
+                _from_option(draft, question.parameter, text)
         elif asks:
             _ask(t, draft, question)
         elif question.parameter == "robot":
@@ -281,20 +277,20 @@ def _lacking(draft: Draft) -> str:
     return f", once it has {' and '.join(missing)}" if missing else ""
 
 
-def _from_option(draft: Draft, question: CellQuestion, text: str) -> None:
-    if question.needs and question.needs not in draft.data:
-        raise InputError(
-            f"{question.option} without --{question.needs.replace('_', '-')}; give both"
-        )
+def _from_option(draft: Draft, parameter: str, text: str) -> None:
+    option, needed = _option(parameter), NEEDS.get(parameter)
+    if needed and needed not in draft.data:
+        raise InputError(f"{option} without {_option(needed)}; give both")
     try:
-        draft.answer(question.parameter, text.strip())
+        draft.answer(parameter, text.strip())
     except InputError as error:
-        raise InputError(f'{question.option} "{text}": {_shortly(error)}') from None
+        raise InputError(f'{option} "{text}": {_shortly(error)}') from None
 
 
 def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
     """Ask until the answer is valid, or empty where the question has a default."""
-    if question.needs and question.needs not in draft.data:
+    needed = NEEDS.get(question.parameter)
+    if needed and needed not in draft.data:
         return
     if question.parameter.endswith("_port"):
         names = machine.permanent_names()

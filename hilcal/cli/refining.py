@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from hilcal import numbers
@@ -119,10 +119,9 @@ def _change(
     options: Options | None,
 ) -> None:
     """Make a revision with an additional effect; without `options`, with the effect removed."""
-    adds = options is not None
     fitting.check_record(record)
     with Campaign.open(run, catalogue) as o, live_viewer(t, view, run) as live:
-        fitting.check_options(o, {effect: options or {}} if adds else {})
+        fitting.check_options(o, {} if options is None else {effect: options})
         with working(t.progress) as say:
             number, previous = fitting.stored_fit(t, o, say, revision)
             if live is not None:
@@ -136,16 +135,10 @@ def _change(
             if live is not None:
                 live.revised(new)
         old, d = o.file.revision(number), c.diagnosis
-        verdict = str(old.result_json.get("diagnose", {}).get("verdict", ""))
-        pair = [Chapter(number, old.added, previous, None, old.removed, verdict), new]
+        before = Chapter(number, old.added, previous, None, old.removed, old.verdict or "")
+        pair = [before, new]
         t.show(errors_by_revision(pair))
-        named = write_effect(effect, options or {})
-        t.show(
-            words.added_effect_sentence(previous, c.fit, named)
-            if adds
-            else words.removed_effect_sentence(previous, c.fit, effect)
-        )
-        t.show([] if c.expected is None else words.addition_lines(c.expected))
+        t.show(words.change_lines(c, write_effect(effect, options or {})))
         t.show(["", words.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
@@ -403,16 +396,8 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
         worst = fit_words.worst_poses(e)
     name = model_name(fitting.effect_titles(fitted.model, fitted.readings))
     t.show(heading(f"{fitting.revision_name(number)}: {name}"))
-    t.show(
-        [
-            fit_words.holdout_sentence(fitted),
-            dependence_sentence(places),
-            "",
-            fit_words.errors(fitted),
-            "",
-        ]
-    )
-    t.show([*fit_words.where_table(places), ""])
+    t.show([fit_words.holdout_sentence(fitted), dependence_sentence(places), ""])
+    t.show([fit_words.errors(fitted), "", *fit_words.where_table(places), ""])
     t.show(fit_words.worst_table(worst, left_out))
     if gross := [f"{g.pose}/{g.load}" for g in gross_errors(fitted)]:
         note = "Gross errors may be listed here; the figures above do not include them"
@@ -426,7 +411,7 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
         variance_factor_interval=list(fitted.variance_factor_interval),
         noise_floor_m=e.noise_floor,
         where=[{"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places],
-        worst=[asdict(w) for w in worst],
+        worst=worst,
     )
 
 

@@ -45,7 +45,7 @@ from hilcal.numbers import sentence
 from hilcal.present.campaign import factory_words
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
-from hilcal.present.progress import Say, full_words, missed_words, watching, working
+from hilcal.present.progress import CampaignProgress, Say, full_words, missed_words, working
 from hilcal.present.registration import covariance_words
 from hilcal.procedure.procedure import checked_plan
 from hilcal.readings.readings import SAME_POSE
@@ -248,9 +248,7 @@ def measure(
     log = RunLog(campaign)
     stored = log.readings()
     kinds = [e["kind"] for e in log.events() if e["kind"] != NOISE_KEY]
-    complete = kinds[-1:] == [
-        "finished"
-    ]  # the last session, which has reported the load on the arm
+    complete = kinds[-1:] == ["finished"]  # the last session has reported the load on the arm
     if goal is not None and stored is not None and goal(stored, last=True).met and complete:
         return campaign.n_readings
     if not log.plan.without(log.done()).steps:
@@ -273,7 +271,7 @@ def measure(
         if viewer is not None:
             viewer.measuring(campaign.path.name, cell, log)
         total, done = len(log.plan.steps), len(log.done())
-        watcher = stack.enter_context(watching(t.progress, total, viewer, done))
+        watcher = stack.enter_context(CampaignProgress(t.progress, total, viewer, done))
         identities = [answer_json(answer) for answer in answers]
         check_same_arm(log, identities)
         log.event("devices", {"answers": identities})

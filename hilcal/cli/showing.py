@@ -175,7 +175,18 @@ def workbench(
     require_nicegui()
     if config is not None:
         table, run = run, run.with_suffix(".hilcal") if output is None else output
-        _import(t, table, config, run, kind, second)
+        if run.exists():
+            raise InputError(
+                f"{run}: the file exists and is not changed; open it with hilcal workbench "
+                f"{quoted(run)}, or choose another name for the table with -o"
+            )
+        from hilcal.library import import_campaign
+
+        with working(t.progress) as say:
+            imported = import_campaign(table, config, run, kind, second, say=say)
+        t.notice(f"{len(imported.readings)} readings of {table} were written to {run}.")
+        for note in (*imported.notes, covariance_words(imported.parts, imported.noise)):
+            t.notice(note)
     elif kind != "table" or second is not None or output is not None:
         raise InputError("--format, --second and -o are for a table; give --config CELL.toml, too")
     elif run.is_file() and not is_campaign(run):
@@ -195,20 +206,3 @@ def workbench(
     if not serve(WorkbenchSession(run, catalogue), port, announce, browser=not no_browser):
         t.notice("The page was not opened in time: its address is no longer valid. Start it again.")
     _end_of_process().start()  # a fit in a thread may delay the end; stored revisions are durable
-
-
-def _import(
-    t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
-) -> None:
-    if run.exists():
-        raise InputError(
-            f"{run}: the file exists and is not changed; open it with hilcal workbench "
-            f"{quoted(run)}, or choose another name for the table with -o"
-        )
-    from hilcal.library import import_campaign
-
-    with working(t.progress) as say:
-        imported = import_campaign(table, config, run, kind, second, say=say)
-    t.notice(f"{len(imported.readings)} readings of {table} were written to {run}.")
-    for note in (*imported.notes, covariance_words(imported.parts, imported.noise)):
-        t.notice(note)

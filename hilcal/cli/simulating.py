@@ -30,10 +30,7 @@ from hilcal.drivers.simulated.rehearsal import (
     simulated_cell,
 )
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import (
-    DeviceError,
-    InputError,
-)
+from hilcal.errors import DeviceError, InputError
 from hilcal.identification.noise.full_covariance import full_readings
 from hilcal.measuring.route import dry_run
 from hilcal.present.diagnosis import RUN_EXPLANATION
@@ -45,11 +42,7 @@ from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.run_log import (
-    REHEARSED,
-    RunLog,
-    create_run,
-)
+from hilcal.store.run_log import REHEARSED, RunLog, create_run
 from hilcal.whole_file import replace_file, spare_other
 
 TRIES = 4
@@ -78,9 +71,7 @@ class RehearsedCampaign:
     """A first campaign, in a simulated cell that can measure again."""
 
     rehearsal: Rehearsal  # the cell, and all readings
-    measure_plan: Callable[
-        [Plan], Rehearsal
-    ]  # measures one more plan into it; returns all readings
+    measure_plan: Callable[[Plan], Rehearsal]  # measures another plan into it; all readings
     measure_missing: Measure  # measures the missing readings of another campaign in the same cell
 
 
@@ -257,9 +248,7 @@ def simulate(
     base_dir, target = cell.absolute().parent, output / "cell.toml"
     spare_other(target, "a cell of hilcal simulate", SIMULATED)
     choice = hide or config.simulation.hide or NO_EFFECT
-    program_config(
-        config, choice, catalogue
-    )  # refuses an effect that cannot be hidden, before planning
+    program_config(config, choice, catalogue)  # refuses an effect that cannot be hidden
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, from which the size of the effect follows")
@@ -268,10 +257,8 @@ def simulate(
             campaign_plan = load_plan(plan)
         say("preparing the simulated cell")
         secret = case_of_plan(config, campaign_plan, choice, number, catalogue, base_dir)
-    if secret.hidden != NO_EFFECT and (config.readings_mode, secret.mode) == (
-        "deflection",
-        "absolute",
-    ):
+    fitted_and_shown = config.readings_mode, secret.mode
+    if secret.hidden != NO_EFFECT and fitted_and_shown == ("deflection", "absolute"):
         cancels = "the hidden effect may cancel" if choice == RANDOM else f"{choice} cancels"
         t.notice(
             f"warning: deflections are planned and fitted, and {cancels} in them; to show it, set "

@@ -1,9 +1,8 @@
 """Reports of `calibrate`, `validate`, `bootstrap` and `compensate`."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -315,38 +314,31 @@ def _contributions(calibration: Calibration, unstated: Sequence[str]) -> Iterato
     yield f"the arm's repeatability ({source})" if known else "no repeatability, which is not known"
 
 
-@dataclass(frozen=True, slots=True)
-class WaypointOutcome:
-    """Outcome of the correction of one waypoint of a program."""
-
-    line: int  # of the program
-    done: str  # "corrected"; unchanged: "left" (not understood) or "refused"
-    why: str | None  # reason for "left" or "refused"
-    blend_m: float  # radius within which the arm passes the waypoint without a stop
-
-
 def waypoint_outcomes(
     waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]
-) -> list[WaypointOutcome]:
-    """Return the outcome of each waypoint; `refused`: a reason or "" per understood waypoint."""
+) -> list[dict[str, Any]]:
+    """Return the outcome of each waypoint; `refused`: a reason or "" per understood waypoint.
+
+    What is not "corrected" is unchanged: "left" (not understood) or "refused", by the reason "why".
+    """
     reasons, out = iter(refused), []
     for w in waypoints:
         why = w.not_corrected or next(reasons)
         done = "left" if w.not_corrected else "refused" if why else "corrected"
-        out.append(WaypointOutcome(w.line, done, why or None, w.blend_m))
+        out.append({"line": w.line, "done": done, "why": why or None, "blend_m": w.blend_m})
     return out
 
 
-def waypoints_table(outcomes: Sequence[WaypointOutcome]) -> Iterator[Block]:
+def waypoints_table(outcomes: Sequence[Mapping[str, Any]]) -> Iterator[Block]:
     """Yield a table of all waypoints of a program; nothing without waypoints."""
     if not outcomes:
         return
     out = table("line", "waypoint", "reason")
     for f in outcomes:
-        passed = f"the arm passes its place within {length(f.blend_m)} and does not stop"
-        out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
+        passed = f"the arm passes its place within {length(f['blend_m'])} and does not stop"
+        out.add(str(f["line"]), f["done"], f["why"] or (passed if f["blend_m"] > 0 else ""))
     yield from ("", out)
-    if any(f.blend_m > 0 and f.done == "corrected" for f in outcomes):
+    if any(f["blend_m"] > 0 and f["done"] == "corrected" for f in outcomes):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
@@ -363,11 +355,8 @@ def fit_and_test_lines(judged: validation.Judged, test: validation.Validation) -
         )
         return
     if judged.fitted:
-        sharing = (
-            f", and {judged.sharing_unloaded} more share an unloaded reading"
-            if judged.sharing_unloaded
-            else ""
-        )
+        shared = judged.sharing_unloaded
+        sharing = f", and {shared} more share an unloaded reading" if shared else ""
         yield (
             f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
             f"{sharing}; they are left out."

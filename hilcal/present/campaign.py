@@ -222,20 +222,20 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
 
 
 def _checks(o: Overview) -> Iterator[tuple[str, str]]:
-    if o.tares:
-        moved = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
+    if tares := [np.array(e["force"]["wrench"]) for e in o.of_kind("tare")]:
+        moved = np.array(tares) - tares[0]
         largest = (np.linalg.norm(m, axis=1).max() for m in np.split(moved, 2, axis=1))
         force, moment = (numbers.digits(size, 2) for size in largest)
-        yield "tares", f"{len(o.tares)}; the zero moved by up to {force} N and {moment} N·m"
+        yield "tares", f"{len(tares)}; the zero moved by up to {force} N and {moment} N·m"
     else:
         yield "tares", "none: no force sensor, or nothing measured yet"
     drift = "no return to the reference pose"
-    if count := len(o.returns):
-        sizes = [float(np.linalg.norm(r.shift_m)) for r in o.returns]
-        k, over = int(np.argmax(sizes)), sum(r.over for r in o.returns)
+    if drifts := o.of_kind("drift"):
+        count, sizes = len(drifts), [float(np.linalg.norm(r["shift_m"])) for r in drifts]
+        k, over = int(np.argmax(sizes)), sum(r["over"] for r in drifts)
         drift = (
             f"{count} return{'s' * (count > 1)} to the reference pose: at most "
-            f"{numbers.length(sizes[k])} ({o.returns[k].sigma:.1f} σ), "
+            f"{numbers.length(sizes[k])} ({drifts[k]['sigma']:.1f} σ), "
             f"{numbers.length(sizes[-1])} at the last; {over or 'none'} over the limit of "
             f"{o.config.acquire.drift_limit_sigma:g} σ"
         )
@@ -304,7 +304,6 @@ def _revisions_tables(o: Overview) -> Iterator[Block]:
         for r in (r for r in o.revisions if r.options["readings"] == kind):
             fit = r.result_json["identify"]
             held = fit["error"]["holdout"]
-            verdict = str(r.result_json.get("diagnose", {}).get("verdict", ""))
             out.add(
                 f"→ {r.number}" if r.number == o.in_use else str(r.number),
                 *["" if r.made_from is None else str(r.made_from)] * branched,
@@ -313,7 +312,7 @@ def _revisions_tables(o: Overview) -> Iterator[Block]:
                 numbers.length(float(held["rms_m"])),
                 f"{float(held['rms_sigma']):.2f}",
                 numbers.digits(float(fit["variance_factor"])),
-                verdict.replace("_", " "),
+                (r.verdict or "").replace("_", " "),
             )
         yield out
 
@@ -370,8 +369,7 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
 
 def verdict_of(record: RevisionRecord) -> str:
     """Return the verdict, or a dash without one."""
-    verdict = record.result_json.get("diagnose", {}).get("verdict")
-    return NO_VALUE if verdict is None else str(verdict).replace("_", " ")
+    return NO_VALUE if record.verdict is None else record.verdict.replace("_", " ")
 
 
 def left_out_m(record: RevisionRecord) -> float:

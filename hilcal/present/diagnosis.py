@@ -1,7 +1,7 @@
 """Reports of diagnoses, revisions and laws: suspects, detectable effects, curves."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from hilcal.present.fit import (
 )
 from hilcal.present.verdict import erring_quantity, headline, implausible, message, unconfirmed
 from hilcal.types import Floats
+
+if TYPE_CHECKING:
+    from hilcal.campaign.changes import StoredChange
 
 MOST_SUSPECTS = 6
 BARS = "▁▂▃▄▅▆▇█"
@@ -66,18 +69,6 @@ def shown_suspects(d: Diagnosis) -> list[Suspect]:
     return [s for s in d.suspects if s.passes or s.score.p_value < MAX_SHOWN_P]
 
 
-def addition_lines(s: Suspect) -> Iterator[str]:
-    """Yield warnings on an added effect: implausible size, or less gain than predicted."""
-    if not s.plausible:
-        yield f"{s.effect} is implausible: it {implausible(s)}."
-    if not s.keeps:
-        yield (
-            f"{s.effect} was predicted to explain {percent(s.share)} of the misfit; the refit "
-            f"confirms {percent(max(s.kept, 0.0))} of that. To remove it: hilcal remove RUN "
-            f"{s.effect}."
-        )
-
-
 def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     """Yield verdict, suspects and the variables that the misfit follows."""
     yield from (heading(f"Model: {model_name(d.fit.model.named)}"), holdout_sentence(d.fit))
@@ -92,7 +83,12 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n"
         )
     if d.verdict != "adequate":
-        yield from _paragraph([*_coarse_lines(d), *doubtful_lines(d)])
+        coarse = (
+            f'{s.coarse} of the model is too coarse; to make it finer: hilcal add RUN "{s.effect}".'
+            for s in d.suspects
+            if s.passes and s.coarse
+        )
+        yield from _paragraph([*coarse, *doubtful_lines(d)])
         yield from (*where_table(d.misfit_breakdown), "")
     yield from _paragraph([*_unexplained(d), *_repeats(d), *redundant_line(d)])
     yield from detectable_sizes(d)
@@ -101,15 +97,6 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
 def _paragraph(parts: Sequence[Block]) -> Sequence[Block]:
     """Return parts, if there are any, with an empty line behind."""
     return [*parts, ""] if parts else []
-
-
-def _coarse_lines(d: Diagnosis) -> Iterator[str]:
-    for s in d.suspects:
-        if s.passes and s.coarse:
-            yield (
-                f"{s.coarse} of the model is too coarse; to make it finer: "
-                f'hilcal add RUN "{s.effect}".'
-            )
 
 
 def _unexplained(d: Diagnosis) -> Iterator[Block]:
@@ -149,23 +136,29 @@ def repeats_sentence(e: PureError) -> str:
     )
 
 
-def added_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
-    """Return a sentence on the change of the error on poses left out by an added effect."""
+def change_lines(c: "StoredChange", effect: str) -> Iterator[str]:
+    """Yield a sentence on the change of the error by an added or removed effect, and warnings."""
+    before, after = c.before, c.fit
     change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
-    if after.holdout.rms_sigma < before.holdout.rms_sigma:
-        return f"With {effect} the error on poses left out falls {change}."
-    return (
-        f"With {effect} the error on poses left out does not fall ({change}): these readings do "
-        "not show this effect. The previous revisions are still stored."
-    )
-
-
-def removed_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
-    """Return a sentence on the change of the error on poses left out by a removed effect."""
-    needed = predicts_better(after, before)
-    verb, end = ("rises", "it is needed") if needed else ("goes", "it is not needed")
-    change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
-    return f"Without {effect} the error on poses left out {verb} {change}: {end}."
+    if c.added is None:
+        needed = predicts_better(after, before)
+        verb, end = ("rises", "it is needed") if needed else ("goes", "it is not needed")
+        yield f"Without {effect} the error on poses left out {verb} {change}: {end}."
+    elif after.holdout.rms_sigma < before.holdout.rms_sigma:
+        yield f"With {effect} the error on poses left out falls {change}."
+    else:
+        yield (
+            f"With {effect} the error on poses left out does not fall ({change}): these readings "
+            "do not show this effect. The previous revisions are still stored."
+        )
+    if (s := c.expected) is not None and not s.plausible:
+        yield f"{s.effect} is implausible: it {implausible(s)}."
+    if s is not None and not s.keeps:
+        yield (
+            f"{s.effect} was predicted to explain {percent(s.share)} of the misfit; the refit "
+            f"confirms {percent(max(s.kept, 0.0))} of that. To remove it: hilcal remove RUN "
+            f"{s.effect}."
+        )
 
 
 def detectable_sizes(d: Diagnosis) -> Iterator[Block]:
@@ -263,38 +256,28 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
     yield from (message(d), "")
 
 
-@dataclass(frozen=True, slots=True)
-class TrueAndFitted:
-    """An estimated parameter and its true value; SI."""
-
-    name: str
-    true: float
-    value: float
-    std: float
-    unit: str
-
-
-def true_and_fitted(fit: Fit, truth: Mapping[str, float]) -> list[TrueAndFitted]:
+def true_and_fitted(fit: Fit, truth: Mapping[str, float]) -> list[dict[str, Any]]:
     """Return the identifiable parameters with a true value, without families that are shrunk."""
-    rows = []
-    for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
-        for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
-            name = f"{effect.name}.{p.name}"
-            comparable = name in truth and effect.groups() is None
-            if comparable and fit.uncertainty.identifiable[k]:
-                value, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
-                rows.append(TrueAndFitted(name, truth[name], value, std, p.unit))
+    parameters = [(e, p) for e in fit.model.effects for p in e.parameters]
+    std, rows = fit.uncertainty.std.tolist(), []
+    for k in np.flatnonzero(fit.uncertainty.identifiable):
+        effect, p = parameters[k]
+        name, value = f"{effect.name}.{p.name}", float(fit.theta[k])
+        if name in truth and effect.groups() is None:
+            row = {"name": name, "true": truth[name], "value": value, "std": std[k]}
+            rows.append({**row, "unit": p.unit})
     return rows
 
 
-def truth_table(rows: Sequence[TrueAndFitted]) -> Iterator[Block]:
+def truth_table(rows: Sequence[Mapping[str, Any]]) -> Iterator[Block]:
     """Yield the table of estimated and true parameters."""
     out = table("parameter", "true", "fitted", "±", "unit", "off by", left=(0, 4))
     for r in rows[:MOST_COMPARED]:
-        unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
-        value, spread, true = numbers.with_std(*(factor * v for v in (r.value, r.std, r.true)))
-        off = f"{abs(r.value - r.true) / r.std:.1f} ±" if r.std > 0 else ""
-        out.add(r.name, true, value, spread, unit, off)
+        value, std, true = (float(r[key]) for key in ("value", "std", "true"))
+        unit, factor = numbers.unit_for(r["unit"], [true, value])
+        off = f"{abs(value - true) / std:.1f} ±" if std > 0 else ""
+        fitted, spread, known = numbers.with_std(*(factor * v for v in (value, std, true)))
+        out.add(r["name"], known, fitted, spread, unit, off)
     yield out
     if len(rows) > MOST_COMPARED:
         yield f"... and {len(rows) - MOST_COMPARED} more"

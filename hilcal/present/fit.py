@@ -1,7 +1,7 @@
 """Reports of fits: parameters, errors, undetermined directions; scalings, streams, priors."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -311,31 +311,24 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class WorstReading:
-    """The worst measurement of a pose: its 3-D error in m, and all its elements together in σ."""
+def worst_poses(e: FullPrediction) -> list[dict[str, Any]]:
+    """Return the worst measurement of each of the worst poses, in units of the noise.
 
-    pose: str
-    load: str
-    error_m: float
-    sigma: float
-
-
-def worst_poses(e: FullPrediction) -> list[WorstReading]:
-    """Return the worst measurement of each of the worst poses, in units of the noise."""
-    distance, out = np.sqrt(e.mahalanobis2), dict[str, WorstReading]()
+    "error_m" is its 3-D error, "sigma" of all its elements together.
+    """
+    distance, out = np.sqrt(e.mahalanobis2), dict[str, dict[str, Any]]()
     for k in np.argsort(-distance, kind="stable").tolist():
         (pose, load), target = e.name(k), e.target_name(k)
         if pose not in out and len(out) < MOST_POSES:
             name, error = f"{pose} {target or ''}".rstrip(), float(np.linalg.norm(e.raw[k, :3]))
-            out[pose] = WorstReading(name, load, error, float(distance[k]))
+            out[pose] = {"pose": name, "load": load, "error_m": error, "sigma": float(distance[k])}
     return list(out.values())
 
 
-def worst_table(worst: Sequence[WorstReading], left_out: bool = False) -> Table:
+def worst_table(worst: Sequence[Mapping[str, Any]], left_out: bool) -> Table:
     """Return the table of the worst poses, as fitted or as predicted when left out."""
     title = "worst poses, each left out" if left_out else "worst poses"
-    rows = ((w.pose, w.load, length(w.error_m), f"{w.sigma:.1f}") for w in worst)
+    rows = ((w["pose"], w["load"], length(w["error_m"]), f"{w['sigma']:.1f}") for w in worst)
     return table(title, "load", "error", "in σ", rows=rows, left=(0, 1))
 
 

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import isfinite
-from typing import Any
+from typing import Any, Self
 
 from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -136,23 +136,30 @@ class _TwoLines(bars.Progress):
             yield Text(task.fields["last"], no_wrap=True, overflow="ellipsis")
 
 
-class _Watcher:
+class CampaignProgress:
     """Shows two live lines on a terminal, with notes above them; elsewhere prints a line per event.
 
-    The live lines disappear during a question, since their refresh would erase it. `also` gets
-    every event, too.
+    The live lines are there as long as the `with` block lasts, but disappear during a question,
+    since their refresh would erase it. `also` gets every event, too.
     """
 
     def __init__(
-        self, console: Console, total: int, also: events.Watcher | None, stored: int
+        self, console: Console, total: int, also: events.Watcher | None = None, stored: int = 0
     ) -> None:
+        """Watch a campaign of `total` readings; previous sessions have measured `stored` steps."""
         self.console, self._start, self._also = console, time.monotonic(), also
         self._fields: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": stored}
         self._fields["total"] = total
         self._shown: _TwoLines | None = None
 
-    def begin(self) -> None:
-        """Show the lines, on a terminal."""
+    def __enter__(self) -> Self:
+        self._begin()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def _begin(self) -> None:
         if not self.console.is_terminal:
             return
         columns = (
@@ -165,8 +172,7 @@ class _Watcher:
         self._shown.add_task("", completed=self._fields["done"], **self._fields)
         self._shown.start()
 
-    def end(self) -> None:
-        """Remove the lines."""
+    def _end(self) -> None:
         if self._shown is not None:
             self._shown.stop()
             self._shown = None
@@ -176,13 +182,13 @@ class _Watcher:
         if self._also is not None:
             self._also.notify(event)
         if isinstance(event, events.Question):
-            self.end()
+            self._end()
             if self.console.is_terminal and self._fields["done"]:
                 left, done, total = (self._fields[key] for key in ("left", "done", "total"))
                 text = f"\n{done} of {total} readings are stored{', ' * bool(left)}{left}."
                 self.console.print(text, style="dim", markup=False)
         elif isinstance(event, events.Answered):
-            self.begin()
+            self._begin()
         elif isinstance(event, events.Remark | events.GoalMet):
             text = f"note: {event.text if isinstance(event, events.Remark) else met_words(event)}"
             if self.console.is_terminal:
@@ -204,22 +210,6 @@ class _Watcher:
             self._shown.update(task, completed=self._fields["done"], **self._fields)
         elif not self.console.is_terminal:
             _line(self.console, self._start, text, width=6)
-
-
-@contextmanager
-def watching(
-    console: Console, total: int, also: events.Watcher | None = None, stored: int = 0
-) -> Iterator[_Watcher]:
-    """Yield a watcher that shows a campaign of `total` readings and passes events to `also`.
-
-    `stored`: number of steps that previous sessions have measured.
-    """
-    watcher = _Watcher(console, total, also, stored)
-    watcher.begin()
-    try:
-        yield watcher
-    finally:
-        watcher.end()
 
 
 def reading_text(event: events.ReadingStored) -> str:

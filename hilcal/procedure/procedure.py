@@ -42,7 +42,7 @@ from hilcal.identification.prediction.validation import Acceptance, acceptance, 
 from hilcal.present.progress import Say
 from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
-from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
+from hilcal.procedure.validation_plan import corrected_plan, paired, validation_plan
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import TEMPERATURES, ArmScatter, Readings
 from hilcal.readings.same_readings import found_among
@@ -50,7 +50,7 @@ from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, REFERENCE_POSITION, Plan, read_plan
+from hilcal.store.plan import LEFT_OUT, REFERENCE, REFERENCE_POSITION, Plan, read_plan
 from hilcal.store.procedure_log import (
     CALIBRATION,
     CORRECTED,
@@ -338,7 +338,8 @@ class Procedure:
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
             uncorrected, corrected = paired(first, last, calibration.mode)
-            left_out = left_out_of(RunLog(moved).plans[-1])
+            listed = RunLog(moved).plans[-1].about.get(LEFT_OUT, [])
+            left_out = [(x["point"], x["why"]) for x in listed if x["point"] != REFERENCE]
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
             log = ProcedureLog(o.file)

@@ -323,12 +323,6 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     return Readings.joined([unloaded, uncorrected]), Readings.joined([unloaded, moved])
 
 
-def left_out_of(plan: Plan) -> list[tuple[str, str]]:
-    """Return the points that a plan leaves out, each with the reason."""
-    listed = [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
-    return [(point, why) for point, why in listed if point != REFERENCE]
-
-
 def expected_states(
     plan: Plan, arm: Arm, config: CellConfig, wrench: Floats, last: States, start: float
 ) -> States:

@@ -15,7 +15,6 @@ from hilcal.store.codec import encode
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.store.stored_texts import COMMAND
-from hilcal.types import Floats
 
 _SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)
 
@@ -30,24 +29,6 @@ class MeasuringDevice:
     serial_number: str | None  # None where it gave none
     facts: Mapping[str, str]  # further answers, by name
     utc: str  # time of the first answer, ISO 8601
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tare:
-    """A zero of the force sensor."""
-
-    utc: str  # time, ISO 8601
-    wrench: Floats  # (6,) wrench read with an empty hook, sensor axes, N and N·m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReferenceReturn:
-    """A return to the reference pose."""
-
-    utc: str  # time, ISO 8601
-    shift_m: Floats  # (3,) shift since the first reading at the pose, sensor axes, m
-    sigma: float  # its size in standard deviations
-    over: bool  # whether it was over the limit of [acquire] drift_limit_sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +47,6 @@ class Overview:
     measured: int  # number of measured steps
     plans: int  # number of plans
     instruments: tuple[MeasuringDevice, ...]  # connected devices, each once
-    tares: tuple[Tare, ...]  # in order
-    returns: tuple[ReferenceReturn, ...]  # in order
     tool: Mapping[str, Any] | None
     """The tool as last identified by the force sensor: mass_kg, com_m, ...; None where it was not.
     """
@@ -81,6 +60,10 @@ class Overview:
     def poses(self) -> int:
         """Number of poses with readings."""
         return 0 if self.readings is None else len(np.unique(self.readings.pose))
+
+    def of_kind(self, kind: str) -> list[Mapping[str, Any]]:
+        """Return the events of a kind, in order."""
+        return [e for e in self.events if e["kind"] == kind]
 
 
 def overview(file: CampaignFile) -> Overview:
@@ -106,13 +89,6 @@ def overview(file: CampaignFile) -> Overview:
         measured=0 if log is None else len(log.done()),
         plans=0 if log is None else len(log.plans),
         instruments=_instruments(of_kind("devices")),
-        tares=tuple(
-            Tare(e["utc"], np.array(e["force"]["wrench"], dtype=float)) for e in of_kind("tare")
-        ),
-        returns=tuple(
-            ReferenceReturn(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
-            for e in of_kind("drift")
-        ),
         tool=_content(of_kind("tool")),
         repeatability=_content(of_kind("repeatability")),
         events=events,
@@ -150,6 +126,8 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     def encoded(*names: str) -> dict[str, object]:
         return {name: encode(getattr(o, name)) for name in names}
 
+    of_return = ("utc", "shift_m", "sigma", "over")
+    returns = [{key: e[key] for key in of_return} for e in o.of_kind("drift")]
     return {
         "campaign": path,
         **encoded("created", "program_version", "source"),
@@ -160,8 +138,8 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
         **encoded("loads", "targets"),
         "covariance": covariance,
         **encoded("plans", "planned", "measured", "instruments"),
-        "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
-        "drift": {"limit_sigma": o.config.acquire.drift_limit_sigma, "returns": encode(o.returns)},
+        "tares": [{"utc": e["utc"], "zero": e["force"]["wrench"]} for e in o.of_kind("tare")],
+        "drift": {"limit_sigma": o.config.acquire.drift_limit_sigma, "returns": returns},
         **encoded("tool", "repeatability", "events", "accepted", "in_use"),
         "revisions": [_revision_json(r, o) for r in o.revisions],
     }
@@ -181,7 +159,7 @@ def _revision_json(r: RevisionRecord, o: Overview) -> dict[str, object]:
         "n_readings": fit["n_readings"],
         "variance_factor": fit["variance_factor"],
         "error": fit["error"],
-        "verdict": r.result_json.get("diagnose", {}).get("verdict"),
+        "verdict": r.verdict,
         "created": r.created,
         "program_version": r.program_version,
         "accepted": r.number == o.accepted,

@@ -44,11 +44,9 @@ def _list(kind: Any) -> Any:
 
 _ERRORS = _of(mean_m=Number, rms_m=Number, max_m=Number, rms_sigma=Number)
 _PARAMETER = _of(name=Text, unit=Text, value=Number | None, std=Number | None, identifiable=bool)
+_ERROR = _of(fit=_ERRORS, holdout=_ERRORS)
 _IDENTIFIED = _of(
-    n_readings=Count,
-    variance_factor=Number,
-    error=_of(fit=_ERRORS, holdout=_ERRORS),
-    parameters=_list(_PARAMETER),
+    n_readings=Count, variance_factor=Number, error=_ERROR, parameters=_list(_PARAMETER)
 )
 _DIAGNOSED = _of(verdict=Text, rejected=(list[Text], []))
 _OPTIONS = _of(

@@ -12,7 +12,7 @@ from nicegui import ui
 
 from hilcal import numbers
 from hilcal.present.campaign import refitted
-from hilcal.present.diagnosis import added_effect_sentence, addition_lines, removed_effect_sentence
+from hilcal.present.diagnosis import change_lines
 from hilcal.present.progress import Say
 from hilcal.workbench import cards
 from hilcal.workbench.session import Answer, Snapshot, WorkbenchSession
@@ -183,10 +183,7 @@ class View:
             act(snapshot, effect, say)
             if (c := self.session.changed) is None:
                 return ""
-            error = (added_effect_sentence if c.added else removed_effect_sentence)(
-                c.before, c.fit, c.added or c.removed or ""
-            )
-            warnings = () if c.expected is None else addition_lines(c.expected)
+            error, *warnings = change_lines(c, c.added or c.removed or "")
             return " ".join([error, f"It is revision {c.number}.", *warnings])
 
         self._do(place, f"{verb} {effect}", do)

@@ -343,10 +343,8 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
                 waypoint = replace(waypoint, not_corrected=_NO_BRANCH)
             waypoint = replace(waypoint, straight=name in STRAIGHT, follows_previous=follows)
             # servoj ends after its time, wherever the arm is
-            last_blocks, at_start = (
-                None if waypoint.not_corrected or name == "servoj" else s.blocks,
-                False,
-            )
+            unknown, at_start = waypoint.not_corrected or name == "servoj", False
+            last_blocks = None if unknown else s.blocks
             out.append(waypoint)
     return tuple(out)
 

@@ -158,7 +158,10 @@ def first_screen(m: ReportContent) -> FirstScreen:
         elif d.lead is not None and not d.wrong_figures:
             name = d.lead.coarse or d.lead.effect
             missing += f" {name} is: {d.fit.model.catalogue[name].summary}."
-    if (z := _unseen_ratio(m)) > MIN_ERROR_RATIO and m.test is not None:
+    z = 0.0
+    if m.test is not None and m.test.validation.judged.unseen:
+        z = m.test.validation.shares.everything.z
+    if m.test is not None and z > MIN_ERROR_RATIO:
         if verdict == "adequate":
             title, tone = "refuted by its validation", "bad"
             good = f"Only where it was fitted. {good.removeprefix('Yes. ')}"
@@ -170,13 +173,6 @@ def first_screen(m: ReportContent) -> FirstScreen:
     )
     title, cards = f"{title[0].upper()}{title[1:]}", tuple(_cards(m))
     return FirstScreen(title, tone, answers, cards, *limit_words(m), verdict)
-
-
-def _unseen_ratio(m: ReportContent) -> float:
-    """Return the rms ratio of error to stated deviation of a validation never fitted; 0 without."""
-    if m.test is None or not m.test.validation.judged.unseen:
-        return 0.0
-    return m.test.validation.shares.everything.z
 
 
 def misfit_sentence(m: ReportContent) -> str:
@@ -228,6 +224,11 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     """Return the verdict on the limit with its basis, and whether it is kept; "", None without."""
     if m.limit_m is None:
         return "", None
+    error = left_out_errors(m.fit)
+    if m.corrected is not None:
+        error = np.array([point["after_m"] for point in m.corrected["points"]])
+    count, over, most = len(error), int(np.sum(error > m.limit_m)), float(error.max())
+    passed = over == 0
     if m.test is not None and m.test.validation.judged.unseen:
         a = m.test.validation.shares
         count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
@@ -235,14 +236,8 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         if a.undecided:
             end += " Noise alone exceeds the limit, so that these readings cannot decide."
     elif m.corrected is not None:
-        error = np.array([point["after_m"] for point in m.corrected["points"]])
-        count, over = len(error), int(np.sum(error > m.limit_m))
-        passed, most = over == 0, float(error.max())
         end = f" (measured at corrected targets, never fitted; largest {length(most)})."
     else:
-        error = left_out_errors(m.fit)
-        count, over = len(error), int(np.sum(error > m.limit_m))
-        passed, most = over == 0, float(error.max())
         none = "No validation campaign was given"
         if m.test is not None:
             none = f"{m.test.name} was fitted itself"
@@ -548,9 +543,8 @@ def _parameters(m: ReportContent) -> PageSection:
                 parts.append(replace(part, caption=caption, heads=heads, rows=cut, narrow=True))
     parts += fit_words.background_line(fit)
     if sizes := family_sizes(fit):
-        parts.append(
-            Chart("Size of each family of effects", charts.family_sizes(sizes), wide=True, height=0)
-        )
+        chart = charts.family_sizes(sizes)
+        parts.append(Chart("Size of each family of effects", chart, wide=True, height=0))
     return PageSection("parameters", "Parameters", tuple(parts))
 
 

@@ -15,7 +15,7 @@ from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.identification.torques import check_torques, require_torques
 from hilcal.measuring.progress import LiveResidual, Phase, ReadingStored
 from hilcal.measuring.session_state import UnloadedVisit, repeatability
-from hilcal.present.progress import watching
+from hilcal.present.progress import CampaignProgress
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
@@ -190,7 +190,7 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
 
 def test_a_campaign_that_goes_on_shows_from_the_start_what_is_stored():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
-    with watching(console, 26, stored=10):
+    with CampaignProgress(console, 26, stored=10):
         pass
     assert "10/26" in console.file.getvalue()
 

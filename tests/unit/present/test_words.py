@@ -214,7 +214,7 @@ def test_p_values_and_how_many_were_tested_read_the_same_wherever_they_stand(
     details = viewer.details(story, revision)
     assert tested in details
     worst = worst_poses(full_prediction(absolute))[0]
-    assert f"Worst: pose {worst.pose}, load {worst.load}," in details
+    assert f"Worst: pose {worst['pose']}, load {worst['load']}," in details
 
 
 # where the model fails
