@@ -46,9 +46,9 @@ The covariance of a judged fit includes a correlation of the noise along the ord
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
 become `ambiguous`.
 
-If the model has a background that the readings prove, but not effect by effect, 3, 5 and 6 become
-`ambiguous` where the residual is noise of any size or the arm's scatter: the suspects are the
-effects of the background, and the size of the noise is stated.
+If the model has a background, 3, 5 and 6 become `ambiguous` where the residual is noise of any size
+or the arm's scatter: its effects predict poses left out, but none is proved by itself. They are the
+suspects, and the size of the noise is stated.
 
 A fit whose covariance includes the estimated scatter (`Readings.arm_scatter`) is judged by the same
 rules, 3 as 5b where the scatter is larger than any arm's. Its residual may be smaller than its
@@ -61,12 +61,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.diagnosis.background_evidence import (
-    JOINT_LEVEL,
-    BackgroundEffect,
-    as_suspects,
-    p_value_of_others,
-)
+from hilcal.diagnosis.background_evidence import BackgroundEffect, as_suspects
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect, ranked
 from hilcal.diagnosis.evidence import (
@@ -100,7 +95,7 @@ MOST_NAMED = 2  # variables that a sentence names
 BACKGROUND_OVERRIDES = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
 )  # fmt: skip
-"""Reasons that "background" overrides where effects are proved together, not one by one."""
+"""Reasons that "background" overrides: its effects predict, but none is proved by itself."""
 IMITATION, NEARLY_ALL = 0.5, 0.85
 """Share of the misfit on poses left out up to which a suspect only imitates an effect of which
 smooth laws predict more than the second share; choices. Of two hidden effects laws predict less."""
@@ -394,7 +389,7 @@ def _without_suspect(
 
 
 def _is_background(e: Evidence, reason: Reason, noise: NoiseVerdict, implausible: bool) -> bool:
-    """Whether the background explains the residual, and is proved together, not one by one.
+    """Whether the background explains the residual, so that its effects are in doubt.
 
     An `implausible` scatter is too large for an arm: noise if repeats show it, since effects too
     small to be resolved scatter alike.
@@ -405,7 +400,7 @@ def _is_background(e: Evidence, reason: Reason, noise: NoiseVerdict, implausible
     repeated = implausible and e.pure_error is not None
     if reason == "misjudged_noise" and not repeated:
         return True
-    return reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL
+    return reason in BACKGROUND_OVERRIDES
 
 
 def _imitates(e: Evidence, lead: Suspect) -> bool:
