@@ -15,8 +15,10 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
+from hilcal.identification.background import with_background
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
@@ -24,7 +26,12 @@ from hilcal.identification.linearisation import linearise
 from hilcal.identification.prediction.full_prediction import full_prediction, nominal_error
 from hilcal.identification.registration.robot_frames import robot_frames
 from hilcal.model.model import Model
-from hilcal.present.diagnosis import curves, diagnosis_report, suspects_table
+from hilcal.present.diagnosis import (
+    added_effect_sentence,
+    curves,
+    diagnosis_report,
+    suspects_table,
+)
 from hilcal.present.fit import (
     before_and_after,
     dependence_sentence,
@@ -341,3 +348,27 @@ def test_a_curve_of_the_terminal_has_degrees(shown):
     told = shown(*curves([Dependence("joint 4 angle", "rad", 0.9, *of)]))
     assert "joint 4 angle [°]" in told
     assert "-180" in told
+
+
+def test_an_error_falls_by_an_added_effect_only_where_a_diagnosis_says_so():
+    """The arm has neither effect; without the comparison with chance both "fell" by 0.2 µm."""
+    c = campaign(mode="deflection", seed=1)
+    before = fitted_model(c.cell, c.readings, "deflection")
+    for effect in ("tool_compliance", "base_compliance"):
+        after = add(before, effect)
+        assert after.holdout.rms_sigma < before.holdout.rms_sigma
+        assert "does not fall by more than it scatters" in added_effect_sentence(
+            before, after, effect
+        )
+    missing = fitted("deflection", "base_compliance")
+    found = add(missing, "base_compliance")
+    assert " falls from " in added_effect_sentence(missing, found, "base_compliance")
+
+
+def test_naming_an_effect_of_the_background_is_no_denial_of_it():
+    c = campaign(mode="deflection", seed=1)
+    f = fitted_model(c.cell, c.readings, "deflection")
+    before = with_background(f, f.model.names)
+    effect = sorted(before.model.background)[0]
+    said = added_effect_sentence(before, add(before, effect), effect)
+    assert said.startswith(f"{effect} is named now; predictions included it already")
