@@ -33,8 +33,8 @@ from hilcal.diagnosis.verdict import (
     NO_HISTORY,
     judge,
     judge_naming,
+    with_doubts,
     with_insufficiency,
-    with_order_step,
 )
 from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.protocol import EffectSpec
@@ -263,7 +263,7 @@ def refine_from(
     if path.shrink():
         path.complete()
     path.judge_sufficiency()
-    path.find_step()
+    path.find_doubts()
     return Refinement(tuple(path.steps))
 
 
@@ -577,10 +577,10 @@ class Path:
         ]
         self.steps = [*previous, last]
 
-    def find_step(self) -> None:
-        """Look for a step in the order of the readings where the misfit is left unexplained."""
+    def find_doubts(self) -> None:
+        """Look for a step in the order, or a suspect, where the misfit is left unexplained."""
         last = self.steps[-1]
-        self.steps[-1] = replace(last, diagnosis=with_order_step(last.diagnosis))
+        self.steps[-1] = replace(last, diagnosis=with_doubts(last.diagnosis))
 
     def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Whether an alternative is worth a trial.

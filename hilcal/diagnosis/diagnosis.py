@@ -12,7 +12,12 @@ import numpy as np
 from hilcal.diagnosis.background_evidence import BackgroundEffect
 from hilcal.diagnosis.confounding import Confounded
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
-from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
+from hilcal.diagnosis.evidence import (
+    Alternative,
+    Insufficiency,
+    Separability,
+    is_misfit,
+)
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import NoiseVerdict, PureError
 from hilcal.diagnosis.order_step import OrderStep
@@ -37,6 +42,7 @@ Reason = Literal[
     "one_suspect",
     "inseparable_suspects",
     "inseparable_addition",
+    "unconfirmed_suspect",
     "insufficient_catalogue",
     "no_suspect",
     "misjudged_noise",
@@ -52,6 +58,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "one_suspect": "missing_effect",
     "inseparable_suspects": "ambiguous",
     "inseparable_addition": "ambiguous",
+    "unconfirmed_suspect": "ambiguous",
     "insufficient_catalogue": "unknown_effect",
     "no_suspect": "unknown_effect",
     "misjudged_noise": "noise_misjudged",
@@ -166,6 +173,17 @@ class Diagnosis(Shown, Tabular):
         return tuple(s.effect for s in self.suspects if s.passes)
 
     @property
+    def unconfirmed(self) -> tuple[Suspect, ...]:
+        """Suspects each of which would leave noise, without surely predicting poses left out."""
+        misfit, dof = self.fit.chi2 - self.fit.dof, self.fit.dof
+        return tuple(
+            s
+            for s in self.suspects
+            if s.explains and s.plausible and s.keeps and not (s.refuted or s.sure)
+            if not is_misfit(dof + (1.0 - s.share) * misfit, dof)
+        )
+
+    @property
     def not_shown(self) -> tuple[str, ...]:
         """Effects, such as geometry in deflections, that no plausible size would reveal here."""
         background = {b.effect for b in self.background}
@@ -247,13 +265,18 @@ def in_doubt(d: Diagnosis, most: int = MOST_IN_DOUBT) -> tuple[str, ...]:
     """Return effects that the readings do not separate; none unless the verdict is `ambiguous`.
 
     They are missing from the model, the first suspect first; or the first was added to the model
-    and the others could replace it; or they all depend on the pose alone, as the misfit does.
+    and the others could replace it; or they all depend on the pose alone, as the misfit does; or
+    each would leave noise, but none surely lowers the error on poses left out. A single one is not
+    separated from another effect, but from chance: further poses of any plan do that.
     """
     if d.reason == "inseparable_suspects":
         return (d.suspects[0].effect, *(s.effect for s in d.separability))[:most]
     if d.reason == "inseparable_addition":
         a = next(a for a in d.alternatives if a.inseparable)
         return (a.effect, *(a.same_as or a.replacements))[:most]
+    if d.reason == "unconfirmed_suspect":
+        names = tuple(s.effect for s in d.unconfirmed)[:most]
+        return names if len(names) > 1 else ()
     return d.pose_alone.effects[:most] if d.pose_alone is not None else ()
 
 

@@ -123,7 +123,29 @@ def diagnose(
     Raises:
         InputError: a fit whose residual is not whitened.
     """
-    return with_order_step(judge(Evidence(fit, say=say), history, whole_catalogue))
+    return with_doubts(judge(Evidence(fit, say=say), history, whole_catalogue))
+
+
+def with_doubts(d: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with the step in the order, or the suspects, that few readings hide."""
+    return with_unconfirmed_suspect(with_order_step(d))
+
+
+def with_unconfirmed_suspect(d: Diagnosis) -> Diagnosis:
+    """Return `unconfirmed_suspect` for `no_suspect` where a suspect may be all that is missing.
+
+    It would leave noise, and nothing recorded predicts more of the misfit on poses left out; but
+    these are so few that the error on them does not surely fall. Then nothing shows that the
+    catalogue lacks the effect.
+    """
+    if d.reason != "no_suspect" or d.fit.model.background:
+        return d
+    found = d.unconfirmed
+    if not found or d.predictable_share > max(s.holdout_share for s in found):
+        return d
+    first = found[0].effect
+    others = [s for s in d.suspects if s.effect != first]
+    return replace(d, reason="unconfirmed_suspect", suspects=(found[0], *others))
 
 
 def with_order_step(d: Diagnosis) -> Diagnosis:

@@ -75,7 +75,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     if d.verdict != "adequate" and not d.dependences:
         yield dependence_sentence(d.misfit_breakdown)
     yield from ("", verdict_line(d), "")
-    if d.significant:
+    if d.significant or d.reason == "unconfirmed_suspect":
         yield suspects_table(d)
         yield note(
             "explains: share of the misfit, the error beyond noise, that adding the effect would "
@@ -260,7 +260,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
     yield holdout_sentence(d.fit)
     if d.verdict != "adequate" and not d.dependences:
         yield dependence_sentence(d.misfit_breakdown)
-    if d.significant:
+    if d.significant or d.reason == "unconfirmed_suspect":
         yield from ("", suspects_table(d))
     yield from (message(d), "")
 
@@ -351,7 +351,7 @@ def no_law_sentence(d: Discovery) -> str:
     elif d.reason == "catalogue":
         why = (
             f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
-            f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
+            f"do ({numbers.names(d.catalogue)}); to add one: hilcal add RUN {d.catalogue[0]}"
         )
     elif d.refused:
         law, refusal = d.refused[0]

@@ -56,6 +56,8 @@ def headline(d: Diagnosis) -> str:
         return f"adequate for deflections; {UNCALIBRATED}"
     if d.wrong_figures:
         return "ambiguous: a figure of the cell may have been entered wrongly"
+    if d.reason == "unconfirmed_suspect":
+        return "ambiguous: these poses are too few to confirm what is missing"
     if d.step is not None:
         return "unknown effect: a step in the order of the readings"
     return HEADLINES[d.verdict]
@@ -158,6 +160,7 @@ def _verdict(d: Diagnosis) -> list[str]:
     of_reason = {
         "one_suspect": _one_suspect,
         "inseparable_suspects": _inseparable,
+        "unconfirmed_suspect": _unconfirmed_suspect,
         "insufficient_catalogue": _insufficient,
         "no_suspect": _no_suspect,
         "misjudged_noise": _misjudged,
@@ -289,6 +292,21 @@ def _inseparable(d: Diagnosis) -> list[str]:
     return [
         f"{lead.effect} {_explains(lead)}.",
         f"These readings do not separate it from {', '.join(map(_separable, rivals))}.",
+        advice,
+    ]
+
+
+def _unconfirmed_suspect(d: Diagnosis) -> list[str]:
+    lead, *others = d.unconfirmed
+    poses = int(d.fit.pose.max()) + 1
+    also = [f"So would {numbers.names([s.effect for s in others])}."] if others else []
+    advice = "Measure more poses: hilcal plan CELL.toml -o PLAN.json --after RUN."
+    if others:
+        advice = "hilcal next plans what separates them; or add one and test it on new poses."
+    return [
+        f"{lead.effect} {_explains(lead)}, and would leave noise.",
+        *also,
+        f"But with {poses} poses the error on poses left out does not surely fall.",
         advice,
     ]
 

@@ -158,6 +158,11 @@ def _nothing_to_separate(o: Campaign, d: Diagnosis) -> str:
             "effects of the background are not told apart one by one; measure more poses, spread "
             f"over all joints, with: {further}"
         )
+    elif d.reason == "unconfirmed_suspect":
+        why = (
+            f"{d.suspects[0].effect} is the only suspect, and these poses are too few to confirm "
+            f"it; measure more poses with: {further}"
+        )
     elif d.verdict == "missing_effect":
         lead = d.suspects[0]
         add = f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"

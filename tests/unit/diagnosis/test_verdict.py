@@ -16,10 +16,11 @@ from hilcal.diagnosis.diagnosis import (
     in_doubt,
 )
 from hilcal.diagnosis.evidence import Alternative, Evidence
-from hilcal.diagnosis.verdict import diagnose, judge
+from hilcal.diagnosis.verdict import diagnose, judge, with_unconfirmed_suspect
 from hilcal.identification.background import with_background
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.numbers import length
 from hilcal.present.verdict import message
@@ -208,3 +209,24 @@ def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
     assert (d.verdict, d.reason, d.significant) == ("adequate", "arm_scatter", ())
     assert d.scatter.kind == "joints"
     assert d.scatter.std[0] == pytest.approx(STD, abs=4 * d.scatter.std_error[0])
+
+
+def test_a_suspect_that_few_poses_do_not_confirm_is_no_unknown_effect():
+    """Of 36 campaigns of 5 to 8 poses 5 said that the catalogue lacks what it explained."""
+    d = diagnose(evidence("joint_tilt_compliance", "deflection", 1, poses=6).fit)
+    lead, *others = d.suspects
+    unsure = replace(lead, left_out=lambda: HeldOut(lead.holdout_share, False))
+    others = [replace(s, explains=False) for s in others]
+    d = replace(d, reason="no_suspect", suspects=(unsure, *others), predictable_share=0.0)
+    found = with_unconfirmed_suspect(d)
+    assert (found.verdict, found.reason) == ("ambiguous", "unconfirmed_suspect")
+    assert message(found).startswith(lead.effect)
+    assert "--after RUN" in message(found)
+    two = with_unconfirmed_suspect(replace(d, suspects=(unsure, replace(unsure, effect="creep"))))
+    assert in_doubt(two) == (lead.effect, "creep")
+    for law in (
+        replace(d, predictable_share=lead.holdout_share + 0.01),  # something else predicts more
+        replace(d, suspects=(replace(unsure, share=0.2), *others)),  # which leaves a misfit
+        replace(d, suspects=(replace(unsure, refuted=True), *others)),
+    ):
+        assert with_unconfirmed_suspect(law).reason == "no_suspect"
