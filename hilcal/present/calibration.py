@@ -129,8 +129,9 @@ def decision_report(
         "plans": f"{cost} would {would}, but the previous plans did not; nothing more is measured.",
         "unknown_effect": "An effect is missing that is not in the catalogue: more readings of "
         "this kind will not name it. The validation shows how much it matters.",
-        "noise_misjudged": "The stated noise is wrong; more readings will not correct that. The "
-        "validation states the error of the arm.",
+        "noise_misjudged": "The residuals are not those of the stated noise, and nothing recorded "
+        "predicts them; more readings will not correct that. The validation states the error of "
+        "the arm.",
         "missing_effect": "An effect is missing that does not lower the error on poses left out.",
         "ambiguous": "Several effects explain the misfit equally well, or a wrongly entered figure "
         "does: the diagnosis names them.",

@@ -56,11 +56,19 @@ def headline(d: Diagnosis) -> str:
         return f"adequate for deflections; {UNCALIBRATED}"
     if d.wrong_figures:
         return "ambiguous: a figure of the cell may have been entered wrongly"
+    if noise_unknown(d):
+        return "in doubt: more is left than the stated noise, and nothing recorded explains it"
     if d.reason == "unconfirmed_suspect":
         return "ambiguous: these poses are too few to confirm what is missing"
     if d.step is not None:
         return "unknown effect: a step in the order of the readings"
     return HEADLINES[d.verdict]
+
+
+def noise_unknown(d: Diagnosis) -> bool:
+    """Whether nothing shows if the noise is wrong, or an effect too weak to be named is missing."""
+    unknown = d.noise is not None and d.noise.reason == "unknown"
+    return unknown and d.reason == "misjudged_noise" and d.scatter is None
 
 
 def message(d: Diagnosis) -> str:
@@ -450,7 +458,8 @@ def _misjudged(d: Diagnosis) -> list[str]:
     few = "Without repeated readings" if repeats is None else "With so few repeated readings"
     return [
         unpredicted,
-        f"{few} it is not known whether the noise is larger than stated: repeat some readings.",
+        f"{few} it is not known whether the noise is larger than stated, or an effect is missing "
+        "that is too weak to be named: repeat some readings.",
     ]
 
 

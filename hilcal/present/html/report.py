@@ -61,7 +61,7 @@ from hilcal.present.story import (
     laws,
     regressor,
 )
-from hilcal.present.verdict import headline, message, repeatability_source
+from hilcal.present.verdict import headline, message, noise_unknown, repeatability_source
 from hilcal.readings.whitening import Scaling
 from hilcal.store.overview import Overview
 from hilcal.store.plan import Plan
@@ -146,7 +146,9 @@ def first_screen(m: ReportContent) -> FirstScreen:
         doubt = verdict in ("ambiguous", "noise_misjudged") and not d.wrong_figures
         tone = "doubt" if doubt else "good" if verdict == "adequate" else "bad"
         if verdict == "noise_misjudged":
-            good = f"This cannot be judged, because the stated noise is wrong. {good}"
+            why = "nothing shows whether the stated noise is right"
+            why = why if noise_unknown(d) else "the stated noise is wrong"
+            good = f"This cannot be judged, because {why}. {good}"
         else:
             yes = verdict == "adequate" or d.reason == "inseparable_addition"
             answer = "Yes" if yes else "Not yet"

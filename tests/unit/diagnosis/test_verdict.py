@@ -16,6 +16,7 @@ from hilcal.diagnosis.diagnosis import (
     in_doubt,
 )
 from hilcal.diagnosis.evidence import Alternative, Evidence
+from hilcal.diagnosis.noise import NoiseVerdict
 from hilcal.diagnosis.verdict import diagnose, judge, with_unconfirmed_suspect
 from hilcal.identification.background import with_background
 from hilcal.identification.baseline import baseline
@@ -23,7 +24,7 @@ from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.numbers import length
-from hilcal.present.verdict import message
+from hilcal.present.verdict import headline, message
 from hilcal.refinement import refine
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
@@ -230,3 +231,11 @@ def test_a_suspect_that_few_poses_do_not_confirm_is_no_unknown_effect():
         replace(d, suspects=(replace(unsure, refuted=True), *others)),
     ):
         assert with_unconfirmed_suspect(law).reason == "no_suspect"
+
+
+def test_a_headline_asserts_no_wrong_noise_that_its_sentence_calls_unknown():
+    d = diagnose(evidence("none", "deflection", 1).fit)
+    for noise, asserted in (("unknown", False), ("too_large", True)):
+        d = replace(d, reason="misjudged_noise", noise=NoiseVerdict(noise), scatter=None)
+        assert ("not what was stated" in headline(d)) == asserted
+        assert ("it is not known" in message(d)) != asserted
