@@ -63,6 +63,7 @@ from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
 
+FOUND_ROWS = 12  # parameters of found effects that refine lists without --details
 MOST_GROSS = 20  # gross errors that compare names
 
 
@@ -139,7 +140,7 @@ def _change(
         pair = [before, new]
         t.show(errors_by_revision(pair))
         t.show(words.change_lines(c, write_effect(effect, options or {})))
-        t.show(["", words.verdict_line(d)])
+        t.show(["", *fit_words.parameters(c.fit, effects=(effect,)), words.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(say, c.number)
@@ -148,6 +149,7 @@ def _change(
         revisions=revisions_json(pair),
         verdict=d.verdict,
         message=message(d),
+        parameters=c.fit.parameters.to_dicts(),
         **{} if c.expected is None else {"addition": c.expected.to_dict()},
         diagnosis=d.to_dict(),
     )
@@ -215,6 +217,9 @@ def refine(
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(gross_error_lines(refinement.fit, details))
+        found = set(refinement.fit.model.named) - set(model.names)
+        most = fit_words.ALL_ROWS if details else FOUND_ROWS
+        t.show(fit_words.parameters(refinement.fit, most, effects=found))
         t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
@@ -242,6 +247,7 @@ def refine(
         verdict=diagnosis.verdict,
         message=message(diagnosis),
         rejected=list(refinement.rejected),
+        parameters=refinement.fit.parameters.to_dicts(),
         background=background_of(refinement.fit).to_json(),
         **{} if laws is None else laws_json(laws),
         frames=frames_to_json(refinement.fit),

@@ -1,6 +1,6 @@
 """Reports of fits: parameters, errors, undetermined directions; scalings, streams, priors."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,12 +105,20 @@ def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
         yield f"  ... and {len(lines) - most} more; --json lists all"
 
 
-def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
-    """Yield a table of `most` parameters, omitting frames first, and families; `where`: of all."""
+def parameters(
+    fit: Fit,
+    most: int = ALL_ROWS,
+    where: str = "--details",
+    effects: Collection[str] | None = None,
+) -> Iterator[Block]:
+    """Yield a table of `most` parameters, omitting frames first, and families; `where`: of all.
+
+    `effects` are those whose parameters are listed; None for all that are named.
+    """
     rows, frames = list[tuple[str, ...]](), list[tuple[str, ...]]()
     families, undetermined = [], []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
-        if effect.name in fit.model.background:
+        if effect.name not in (fit.model.named if effects is None else effects):
             continue
         index = np.arange(s.start, s.stop)
         if effect.groups() is not None or len(index) > ALL_ROWS:

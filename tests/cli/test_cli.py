@@ -137,11 +137,14 @@ def test_add_shows_the_error_before_and_after(campaign, capsys):
     assert after["variance_factor"] < before["variance_factor"]
     assert d["verdict"] == "adequate"
     check_document(d)
+    shown = {p["name"] for p in d["parameters"]}
+    assert {"hysteresis.j1", "joint_compliance.j1"} <= shown
     in_file, _ = latest(campaign)
     assert (in_file["verdict"], in_file["message"]) == (d["verdict"], d["message"])
     assert "already" in refused(capsys, 2, "add", campaign, "hysteresis")
     words = ok(capsys, "add", campaign, "base_compliance").out
-    assert "base_compliance" in words
+    assert "base_compliance.x" in words  # its parameters, and no others
+    assert "hysteresis.j1" not in words
     assert "does not fall" in words  # the model is adequate without
 
 
