@@ -13,6 +13,7 @@ from hilcal.cli import fitting
 from hilcal.cli.options import check_output, command
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NO_HISTORY
@@ -78,7 +79,28 @@ def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None 
         fitting.compute_errors(fitted, say)
     t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
+    _show_next_command(t, catalogue, run, revision, d)
     t.document({"revision": number, **d.to_dict()})
+
+
+def _show_next_command(
+    t: Terminal, catalogue: Catalogue, run: Path, revision: int | None, d: Diagnosis
+) -> None:
+    """Print the command that adds what is missing, or plans what separates the suspects."""
+    doubt = in_doubt(d)
+    if d.verdict == "missing_effect" and d.lead is not None:
+        what, effects = "To add it, and see the error before and after:", [d.lead.effect]
+        line = ["hilcal", "add", quoted(run), quoted(d.lead.effect)]
+    elif doubt:
+        what, effects = "To plan the measurements that separate them:", list(doubt)
+        line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
+    else:
+        return
+    line += [] if revision is None else ["--revision", str(revision)]
+    for path in {f.path for f in map(catalogue.file_of, effects) if f is not None}:
+        line += ["--effects-from", quoted(path)]
+    t.show(what)
+    t.command(" ".join(line))
 
 
 @command("""

@@ -288,7 +288,7 @@ def dependence_sentence(places: Sequence[MisfitShare]) -> str:
     same = [p for p in clear if p.variable == POSE and p.share > 0.5]
     causes = [p for p in clear if p.variable != POSE and not p.variable.startswith("direction")][:3]
     named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
-    statement = f"The misfit follows {named or 'none of the recorded variables'}"
+    statement = f"The misfit follows {named or 'none of the recorded variables alone'}"
     if sides:
         side = sides[0].variable.removeprefix("direction ")
         statement += f"; {percent(sides[0].share)} of it is {side}"

@@ -179,6 +179,13 @@ def test_an_effect_that_an_earlier_model_lacks(run, tmp_path, capsys):
     assert "for this comparison alone" not in ok(capsys, "compare", run, later).out
 
 
+def test_what_a_diagnosis_says(fitted, capsys):
+    said = ok(capsys, "diagnose", fitted).out
+    assert "falls from" in follow(capsys, said, f"hilcal add '{fitted}' hysteresis").out
+    said = ok(capsys, "diagnose", fitted, "--revision", "1").out
+    follow(capsys, said, f"hilcal add '{fitted}' hysteresis --revision 1")
+
+
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 

@@ -248,7 +248,8 @@ def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
 
 
 @pytest.mark.parametrize(
-    ("p", "followed"), [(0.003, "none of the recorded variables"), (1e-5, "joint 2 torque (23 %)")]
+    ("p", "followed"),
+    [(0.003, "none of the recorded variables alone"), (1e-5, "joint 2 torque (23 %)")],
 )
 def test_the_misfit_follows_what_counts_in_the_table(p, followed, shown):
     """Of twenty variables one has such a p-value by chance."""
