@@ -372,8 +372,7 @@ class Path:
             return True
         # the sizes of the background were estimated without the law, and contain a part of it
         refitted = with_background(larger, [*last.fit.model.named, law])
-        self._append_background(larger if refitted is None else refitted, law)
-        return True
+        return self._append_background(larger if refitted is None else refitted, law)
 
     def _add_suspect(self) -> bool:
         """Try the suspects, best first; returns whether one was added.
@@ -468,8 +467,7 @@ class Path:
             if not predicts_better(named, fitted) or share <= d.predictable_share:
                 return False
         self._say("the background of all effects predicts better; diagnosing")
-        self._append_background(fitted, BACKGROUND)
-        return True
+        return self._append_background(fitted, BACKGROUND)
 
     def add_remainder(self) -> bool:
         """Fit what follows the pose beside the added effects alone; whether the model has it now.
@@ -494,18 +492,22 @@ class Path:
             if alone is not None and not predicts_better(alone, fitted):
                 fitted = alone
         self._say("what follows the pose predicts better; diagnosing")
-        self._append_background(fitted, REMAINDER)
-        return True
+        return self._append_background(fitted, REMAINDER)
 
-    def _append_background(self, fitted: Fit, added: str) -> None:
+    def _append_background(self, fitted: Fit, added: str) -> bool:
         """Append a fit with a background, and the same fit with more and more effects named.
 
         Where smooth laws predict what the background leaves on poses left out, it has a remainder
         (`with_remainder`). Those effects are named that the readings prove beside all others; none
         where laws predict what the remainder leaves, as any may only resemble what is missing.
+        Returns False, and appends nothing, where its effects cannot be tested numerically.
         """
         fitted = with_remainder(fitted, self._regressions) or fitted
-        tested = background_evidence(fitted)
+        try:
+            tested = background_evidence(fitted)
+        except CannotAnswerError as error:
+            self._say(f"the background is left out: {error}")
+            return False
         unknown = self._regressions.of(linearise(fitted)).significant
         names = [] if unknown else [name for name in proved(tested) if name != REMAINDER]
         names = names[: MOST_REVISIONS - len(self.steps) - 1]
@@ -520,6 +522,7 @@ class Path:
         )
         for step in map(RefinementStep, fits, diagnoses, (added, *names)):
             self._append(step)
+        return True
 
     def add_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether the covariance changed.

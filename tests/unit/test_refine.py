@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilcal import refinement
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.stepwise import add
 from hilcal.drivers.simulated.injected_effects import hide_effect
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.identification.carried.posterior import Posterior
@@ -208,3 +210,20 @@ def test_a_prior_of_another_arm_is_left_out():
     assert r.names == ("base_frame", *names, "encoder_offset")
     assert r.fit.holdout.rms_m < 0.1 * last_with.holdout.rms_m
     assert "The prior was left out" in prior_report(r)[-1]
+
+
+def test_a_background_that_cannot_be_tested_leaves_the_revisions(monkeypatch):
+    """The whole refinement ended with "the mixed model's equations have no solution"."""
+
+    def unsolved(fitted):
+        raise CannotAnswerError("the mixed model's equations have no solution")
+
+    c = campaign("transmission_error", seed=1)
+    said = []
+    path = Path(fitted_model(c.cell, c.readings, c.mode), say=said.append)
+    monkeypatch.setattr(refinement, "background_is_better", lambda before, after: True)
+    monkeypatch.setattr(refinement, "allows_background", lambda fitted: True)
+    monkeypatch.setattr(refinement, "background_evidence", unsolved)
+    assert not path.add_background()
+    assert len(path.steps) == 1
+    assert "the background is left out" in said[-1]
