@@ -136,30 +136,33 @@ def repeats_sentence(e: PureError) -> str:
     )
 
 
-def change_lines(c: "StoredChange", effect: str) -> Iterator[str]:
-    """Yield a sentence on the change of the error by an added or removed effect, and warnings.
+def change_sentence(before: Fit, after: Fit, effect: str, *, added: bool) -> str:
+    """Return a sentence on the change of the error by an added or removed effect.
 
     It falls only where it does so by more than it scatters from pose to pose.
     """
-    before, after = c.before, c.fit
     change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
-    if c.added is None:
+    if not added:
         needed = predicts_better(after, before)
         verb, end = ("rises", "it is needed") if needed else ("goes", "it is not needed")
-        yield f"Without {effect} the error on poses left out {verb} {change}: {end}."
-    elif before.model.background - after.model.background:
-        yield (
+        return f"Without {effect} the error on poses left out {verb} {change}: {end}."
+    if before.model.background - after.model.background:
+        return (
             f"{effect} is named now; predictions included it already, as part of the background: "
             f"the error on poses left out goes {change}."
         )
-    elif predicts_better(before, after):
-        yield f"With {effect} the error on poses left out falls {change}."
-    else:
-        yield (
-            f"With {effect} the error on poses left out does not fall by more than it scatters "
-            f"from pose to pose ({change}): these readings do not show this effect. The previous "
-            "revisions are still stored."
-        )
+    if predicts_better(before, after):
+        return f"With {effect} the error on poses left out falls {change}."
+    return (
+        f"With {effect} the error on poses left out does not fall by more than it scatters from "
+        f"pose to pose ({change}): these readings do not show this effect. The previous revisions "
+        "are still stored."
+    )
+
+
+def change_lines(c: "StoredChange", effect: str) -> Iterator[str]:
+    """Yield `change_sentence` of a stored change, and warnings."""
+    yield change_sentence(c.before, c.fit, effect, added=c.added is not None)
     if (s := c.expected) is not None and not s.plausible:
         yield f"{s.effect} is implausible: it {implausible(s)}."
     if s is not None and not s.keeps:

@@ -27,7 +27,7 @@ from hilcal.identification.prediction.full_prediction import full_prediction, no
 from hilcal.identification.registration.robot_frames import robot_frames
 from hilcal.model.model import Model
 from hilcal.present.diagnosis import (
-    added_effect_sentence,
+    change_sentence,
     curves,
     diagnosis_report,
     suspects_table,
@@ -358,12 +358,11 @@ def test_an_error_falls_by_an_added_effect_only_where_a_diagnosis_says_so():
     for effect in ("tool_compliance", "base_compliance"):
         after = add(before, effect)
         assert after.holdout.rms_sigma < before.holdout.rms_sigma
-        assert "does not fall by more than it scatters" in added_effect_sentence(
-            before, after, effect
-        )
+        said = change_sentence(before, after, effect, added=True)
+        assert "does not fall by more than it scatters" in said
     missing = fitted("deflection", "base_compliance")
     found = add(missing, "base_compliance")
-    assert " falls from " in added_effect_sentence(missing, found, "base_compliance")
+    assert " falls from " in change_sentence(missing, found, "base_compliance", added=True)
 
 
 def test_naming_an_effect_of_the_background_is_no_denial_of_it():
@@ -371,5 +370,5 @@ def test_naming_an_effect_of_the_background_is_no_denial_of_it():
     f = fitted_model(c.cell, c.readings, "deflection")
     before = with_background(f, f.model.names)
     effect = sorted(before.model.background)[0]
-    said = added_effect_sentence(before, add(before, effect), effect)
+    said = change_sentence(before, add(before, effect), effect, added=True)
     assert said.startswith(f"{effect} is named now; predictions included it already")
