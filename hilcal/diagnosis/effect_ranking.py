@@ -42,7 +42,6 @@ from hilcal.diagnosis.minimum_detectable_effect import (
     least_of_family,
     least_strength,
 )
-from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect, JointResidual
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
@@ -135,9 +134,14 @@ class Suspect(Brief):
         return self.least.visible and self.least.ordinary <= self.most
 
     @property
+    def promises(self) -> bool:
+        """Whether the suspect passes all tests of the linearised model."""
+        return self.explains and self.sure and self.plausible
+
+    @property
     def passes(self) -> bool:
         """Whether the suspect passes all tests."""
-        return self.explains and self.sure and self.plausible and self.keeps
+        return self.promises and self.keeps
 
     @property
     def plausible(self) -> bool:
@@ -268,9 +272,8 @@ def largest_plausible(family: EffectColumns, unloaded: UnloadedReadings | None) 
 def rank_suspects(
     p: Linearisation,
     effects: Sequence[Effect],  # that are not in the model
-    refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
-    """Score all effects; best first, see `ranked`."""
+    """Score all effects, without refits; best first, see `ranked`."""
     noise = cache(partial(SimulatedCampaigns.noise, p))
     suspects = [_suspect(p, s, len(effects), noise) for s in _scored(p, effects)]
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
@@ -280,15 +283,12 @@ def rank_suspects(
     for effect, s in zip(effects, suspects, strict=True):
         explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
-        if s.passes:
+        if s.promises:
             family = effect_columns(p.fit, effect)
             if no_load and acts_through_load(effect):
                 s = replace(s, refuted=not beyond_geometry(p, family, geometry()))
-            if s.passes:
-                kept = kept_by_step(p, family, s.score)
-                if kept < LEAST_KEPT and (after := refit(p.fit, effect.name)) is not None:
-                    kept = max(kept, kept_by_refit(p.fit, after, s.score))
-                s = replace(s, kept=kept)
+            if s.promises:
+                s = replace(s, kept=kept_by_step(p, family, s.score))
         out.append(s)
     return ranked(out)
 
@@ -299,7 +299,7 @@ def added_suspect(before: Fit, after: Fit) -> Suspect:
     if effect.name in before.model.names:  # a finer form of it
         effect = copy(effect)
         effect.name, effect.coarse = f"{effect.name}, finer", effect.name
-    (s,) = rank_suspects(p, [effect], refit=lambda fit, name: after)
+    (s,) = rank_suspects(p, [effect])
     return replace(s, kept=kept_by_refit(before, after, s.score))
 
 

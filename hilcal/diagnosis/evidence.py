@@ -29,7 +29,7 @@ repeats or a generic regression show that it is not noise.
 """
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
 
@@ -44,7 +44,9 @@ from hilcal.diagnosis.effect_ranking import (
     Suspect,
     candidates,
     catalogue_columns,
+    kept_by_refit,
     rank_suspects,
+    ranked,
 )
 from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnosis.noise import (
@@ -263,6 +265,7 @@ class Evidence:
         self._regressions = regressions or Regressions()
         self._background = background
         self._alternatives: dict[str, Alternative] = {}
+        self._kept: dict[str, float] = {}  # by a refit, see `Suspect.kept`
 
     @cached_property
     def linearisation(self) -> Linearisation:
@@ -275,16 +278,37 @@ class Evidence:
         return candidates(self.fit)
 
     @cached_property
-    def suspects(self) -> tuple[Suspect, ...]:
-        """`effects`, scored; best first."""
-        return rank_suspects(self.linearisation, self.effects, refit=self._refit)
+    def _scored(self) -> tuple[Suspect, ...]:
+        return rank_suspects(self.linearisation, self.effects)
+
+    def suspects(self, rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
+        """Return `effects`, scored; best first, see `ranked`.
+
+        A refit decides where the exact model loses the promise of the linearisation; not of a
+        suspect that leaves the lead to another one in any case.
+        """
+        while True:
+            kept = (replace(s, kept=self._kept.get(s.effect, s.kept)) for s in self._scored)
+            order = ranked(kept, rejected)
+            most = max((s.score.log_evidence for s in order if s.passes), default=-np.inf)
+            doubtful = (
+                s
+                for s in order
+                if s.promises and not s.keeps and s.effect not in self._kept
+                if s.score.log_evidence > most - SAME_EVIDENCE
+            )
+            if (s := next(doubtful, None)) is None:
+                return order
+            after = self._refit(self.fit, s.effect)
+            refitted = 0.0 if after is None else kept_by_refit(self.fit, after, s.score)
+            self._kept[s.effect] = max(s.kept, refitted)
 
     @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
         """Figures of the cell that seem to be wrong."""
         stated = self.fit.readings.noise_stated
         if self.misfit or self.fit.outlier.any() or not stated or loads_reversed(self.fit):
-            return wrong_figures(self.fit, self.suspects)
+            return wrong_figures(self.fit, self.suspects())
         return ()
 
     @cached_property

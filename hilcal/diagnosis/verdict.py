@@ -272,11 +272,11 @@ def _with_arrivals(e: Evidence, history: History, whole_catalogue: bool) -> Diag
 def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     """Judge by rules 1 to 6, with the covariance of the fit."""
     added = () if e.fit.model.background else history.added
-    suspects = ranked(e.suspects, history.rejected)
+    suspects = e.suspects(history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
     if lead is not None and _imitates(e, lead):
         passing = [s.effect for s in suspects if s.passes]
-        suspects, lead = ranked(e.suspects, {*history.rejected, *passing}), None
+        suspects, lead = ranked(suspects, {*history.rejected, *passing}), None
     if lead is None:
         found = _without_suspect(e, suspects, added)
     else:
