@@ -115,8 +115,8 @@ def decision_report(
         scope, also = " for deflections", f" {numbers.sentence(UNCALIBRATED)}"
     reasons = {
         "adequate": f"The model is adequate{scope}; nothing more is measured to fit it.{also}",
-        "goal_met": f"The model is adequate, and the goal of {goal} is met{scope}: nothing more is "
-        f"measured to fit it.{also}",
+        "goal_met": ("The model is adequate, and the" if d.verdict == "adequate" else "The")
+        + f" goal of {goal} is met{scope}: nothing more is measured to fit the model.{also}",
         "doubt": f"{names} are in doubt: {cost} will separate them, {power}.",
         "goal": f"The goal is {goal}: {cost} are predicted to lower this to {then}.",
         "floor": f"The goal of {goal} is out of reach: the arm's repeatability and what the model "
@@ -133,8 +133,8 @@ def decision_report(
         "predicts them; more readings will not correct that. The validation states the error of "
         "the arm.",
         "missing_effect": "An effect is missing that does not lower the error on poses left out.",
-        "ambiguous": "Several effects explain the misfit equally well, or a wrongly entered figure "
-        "does: the diagnosis names them.",
+        "ambiguous": "These readings do not tell which effects the arm has, or a figure of the "
+        "cell seems to be wrong: the diagnosis names them.",
     }
     yield f"{reasons[d.reason]}\n"
 

@@ -60,6 +60,8 @@ def headline(d: Diagnosis) -> str:
         return "in doubt: more is left than the stated noise, and nothing recorded explains it"
     if d.reason == "unconfirmed_suspect":
         return "ambiguous: these poses are too few to confirm what is missing"
+    if d.reason == "background":
+        return "ambiguous: the arm has more effects than these poses prove"
     if d.step is not None:
         return "unknown effect: a step in the order of the readings"
     return HEADLINES[d.verdict]

@@ -271,7 +271,9 @@ class FurtherMeasuring:
             if sharper is not None and (further is None or sharper.measures):
                 further = sharper
         if further is None:
-            reached = settings.goal_m is not None and d.verdict == "adequate"
+            # the predicted error has the uncertainty of what a background only predicts
+            explained = d.verdict == "adequate" or d.reason == "background"
+            reached = settings.goal_m is not None and explained
             return Decision("goal_met" if reached else d.verdict, d.verdict, error)
         if not further.measures:
             return further

@@ -154,6 +154,8 @@ def first_screen(m: ReportContent) -> FirstScreen:
             answer = "Yes" if yes else "Not yet"
             if verdict == "unknown_effect" and d.background:
                 answer = "In part: smooth functions of the pose stand for an effect that is unknown"
+            elif d.reason == "background":
+                answer = "In part: it includes effects that these poses do not prove"
             good = f"{answer}. {good}"
         if verdict == "adequate":
             missing = "No effect that these readings could show."
