@@ -184,8 +184,9 @@ class _SerialProblem:
         return self.correlated(np.eye(len(self.t)))
 
     def rivals(self) -> tuple[list[str], Floats]:
-        """Names and K_f (F, R, R) of all rivals."""
-        scaled = [(name, k * (len(k) / t)) for name, k in self._rivals() if (t := np.trace(k)) > 0]
+        """Names and K_f (F, R, R) of all rivals; without those that cancel, as the pose's may."""
+        sized = [(name, k, np.trace(k) / len(k)) for name, k in self._rivals()]
+        scaled = [(name, k / size) for name, k, size in sized if size > ROUNDING]
         return [name for name, _ in scaled], np.stack([k for _, k in scaled])
 
     def _rivals(self) -> Iterator[tuple[str, Floats]]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import hilcal as hc
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cli.demo import CELL
 from hilcal.config import load_config
@@ -19,6 +20,7 @@ from hilcal.store.rows import content_hash
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
 from tests.support.fit_cases import fitted_model, refined
+from tests.support.paths import ROOT
 from tests.support.rows import first
 
 
@@ -122,3 +124,15 @@ def test_a_few_readings_and_very_many_are_not_judged():
     many = replace(white, raw=np.zeros((MOST_READINGS + 1, 3)))
     assert serial_noise(few) is None
     assert serial_noise(many) is None
+
+
+def test_a_shift_of_a_pose_is_no_rival_in_deflections(tmp_path):
+    """It cancels there: its covariance was rounding errors, scaled up, and not positive."""
+    cell = tmp_path / "cell.toml"
+    cell.write_text(
+        '[robot]\nmodel = "ur10e"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
+        'load_point_m = [0.1, 0.0, 0.15]\n[tracker]\nframe = "base"\n'
+        "[repeatability]\njoint_std_rad = 1e-5\n"
+    )
+    readings = hc.read_table(ROOT / "tests" / "data" / "three_poses.csv", hc.Cell.load(cell))
+    assert serial_noise(hc.fit(hc.baseline(hc.Cell.load(cell), readings), readings)) is None
