@@ -25,9 +25,15 @@ from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identification.fit_document import with_nulls
 from hilcal.measuring.connect import ConnectionResult, connect, reported_kinematics, with_kinematics
 from hilcal.measuring.route import DryRun, dry_run
-from hilcal.names import quoted
 from hilcal.present.campaign import check_report
-from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
+from hilcal.present.plan import (
+    adding_lines,
+    brief_plan,
+    next_report,
+    plan_report,
+    plan_screen,
+    poses_report,
+)
 from hilcal.present.progress import Say, working
 from hilcal.procedure.next_plan import Doubt, doubt_to_settle, fit_without, next_plan
 from hilcal.procedure.procedure import with_origin
@@ -261,11 +267,10 @@ def next_(
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
-    t.show(f"The plan is in {output}. To add its readings to the campaign:")
-    t.show(
-        f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "
-        f"--plan {quoted(output)}"
-    )
+    how, *commands = adding_lines(run, output, cell, planned.appendable)
+    t.show(f"The plan is in {output}. {how}")
+    for line in commands:
+        t.show(f"  {line}")
     t.document(
         checked_plan.to_dict(), plan=str(output), suspects=list(effects), **separates(chosen)
     )

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from hilcal import numbers
 from hilcal.design.next import SEPARATED_POWER, PairPower, SeparatingPlan
 from hilcal.design.run_order import Confounding
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
+from hilcal.names import quoted
 from hilcal.numbers import digits, length
 from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
 from hilcal.present.progress import duration_text
@@ -267,6 +269,25 @@ def next_report(
     )
     yield f"{powers_summary(plan.powers, poses, readings)} {_difference(plan)}\n"
     yield from (f"note: {remark}" for remark in plan.notes)
+
+
+def adding_lines(run: Path, plan: Path, cell: Path | None, appendable: bool) -> tuple[str, ...]:
+    """Return how the readings of a further plan are added to a campaign, and the commands.
+
+    A campaign that was imported, and so is not `appendable`, is imported again with them.
+    """
+    config = cell or "CELL.toml"
+    if appendable:
+        return (
+            "To add its readings to the campaign:",
+            f"hilcal run {quoted(config)} -o {quoted(run)} --append --plan {quoted(plan)}",
+        )
+    return (
+        "hilcal run did not measure the campaign: measure the states of the plan as its others, "
+        "append them to its table, each pose under a new name, and import the table again:",
+        f"hilcal export {quoted(run)} --readings READINGS.csv",
+        f"hilcal import READINGS.csv --config {quoted(config)} -o NEW.hilcal",
+    )
 
 
 def poses_report(

@@ -26,6 +26,7 @@ from hilcal.procedure.validation_plan import recorded_columns
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
+from hilcal.store.run_log import PLAN
 from hilcal.types import Floats
 
 POSES = 20
@@ -95,6 +96,7 @@ class NextPlan:
 
     separating: SeparatingPlan  # the powers, pair by pair
     checked: CheckedPlan  # the plan, all motions checked
+    appendable: bool  # whether the campaign was measured by a plan, so that another can follow
 
 
 def next_plan(
@@ -117,7 +119,8 @@ def next_plan(
     compare = compare and not doubt.pose_alone
     summary = summarise(chosen.planned, cell.configured(), rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
-    return NextPlan(chosen, checked(cell, plan_of(chosen, doubt.suspects), summary))
+    plan = checked(cell, plan_of(chosen, doubt.suspects), summary)
+    return NextPlan(chosen, plan, o.file.about(PLAN) is not None)
 
 
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:

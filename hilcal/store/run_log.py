@@ -14,6 +14,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
+from hilcal.names import quoted
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
@@ -163,7 +164,9 @@ class RunLog:
         if text is None:
             raise InputError(
                 f"{campaign.path}: the campaign was not measured with `hilcal run`; "
-                "it cannot be resumed"
+                "it cannot be resumed or appended to; further readings of it go into its table "
+                f"(hilcal export {quoted(campaign.path)} --readings READINGS.csv), which is "
+                "imported again"
             )
         self._campaign = campaign
         where = f"{campaign.path}, its plan"

@@ -22,7 +22,7 @@ from hilcal.present.diagnosis import shown_suspects, suspects_table
 from hilcal.present.document import Table, description_of, load_name
 from hilcal.present.document import table as block
 from hilcal.present.fit import dependence_sentence, holdout_sentence, model_name
-from hilcal.present.plan import power_rows, powers_summary
+from hilcal.present.plan import adding_lines, power_rows, powers_summary
 from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
@@ -389,9 +389,12 @@ def plan_card(view: View, d: Snapshot) -> None:
         small_print(
             f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then."
         )
-    ui.label(f"The plan is in {path.name}. To add its readings to the campaign:")
-    ui.label(view.session.run_line()).classes("code")
-    small_print("Then read the file again here.")
+    how, *commands = adding_lines(view.session.path, path, None, next_.appendable)
+    ui.label(f"The plan is in {path.name}. {how}")
+    for line in commands:
+        ui.label(line).classes("code")
+    if next_.appendable:
+        small_print("Then read the file again here.")
 
 
 class Status:

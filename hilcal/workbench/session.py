@@ -34,7 +34,6 @@ from hilcal.effects.written import read_effects_text
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.prediction.full_prediction import full_prediction
-from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.present.registration import covariance_words
 from hilcal.present.story import (
@@ -270,11 +269,6 @@ class WorkbenchSession:
         plan.checked.save(output)
         self.planned = plan, output
         return plan
-
-    def run_line(self) -> str:
-        """Return the command that measures the plan into the same campaign."""
-        plan = "PLAN" if self.planned is None else self.planned[1]
-        return f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(plan)}"
 
     @property
     def stale(self) -> bool:

@@ -59,7 +59,8 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
         "chance to rule out",
         "What separates the weakest pair comes from ",
         "power to separate the leading suspects",
-        f"--append --plan {again}",
+        f"hilcal export {ambiguous} --readings READINGS.csv",
+        "hilcal import READINGS.csv --config CELL.toml",
     ):
         assert part in " ".join(words.split())
     assert max(map(len, words.splitlines())) <= 100

@@ -512,7 +512,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(browser, tmp_path):
         page.get_by_label("poses (as needed)").fill("8")
         page.get_by_role("button", name="Plan the next measurements").click()
         expect(page.locator("[data-part=planned]")).to_contain_text("readings at", timeout=WAIT)
-        expect(page.locator(".code")).to_contain_text("--append --plan")
+        expect(page.locator(".code")).to_contain_text(["hilcal export", "hilcal import"])
         assert (tmp_path / "run-next-0.json").is_file()
         page.get_by_role("button", name="Open the 3-D view").click()
         frame = page.frame_locator("iframe")
