@@ -65,6 +65,8 @@ class MisfitShare:
     variable: str  # e.g. "joint 2 angle", "joint 2 torque", "load", "time"
     share: float  # of the misfit that the variable predicts on poses left out, but see `Group`
     p_value: float  # of the joint test
+    sure: bool = True
+    """Whether the error on poses left out falls by more than it scatters from pose to pose."""
 
     @property
     def group(self) -> Group:
@@ -100,7 +102,7 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
         scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
         held_out = p.held_out(list(zip(products, scores, strict=True)))
         for (name, _), score, h in zip(batch, scores, held_out, strict=True):
-            out.append(MisfitShare(name, max(h.share, 0.0), score.p_value))
+            out.append(MisfitShare(name, max(h.share, 0.0), score.p_value, h.significant))
     # A pose left out cannot predict itself, so its share is in-sample, less the part that as many
     # columns explain by chance.
     if (c := pose_constants(p)) is not None:

@@ -10,7 +10,7 @@ The rules, in this order:
    `ambiguous`.
 3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
    replace an addition to the model.
-4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
+4. χ² is too large, and something recorded surely predicts a share of the misfit on poses left out, or
    repeats of a pose have it in common: `unknown_effect`, with that share. If no variable predicts
    it beyond chance, and it is the same under every load of a pose, more poses would identify it
    (see `pose_alone`): `ambiguous`.
@@ -69,6 +69,7 @@ from hilcal.diagnosis.evidence import (
     Evidence,
     Insufficiency,
     Separability,
+    is_misfit,
     separability,
 )
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
@@ -362,13 +363,15 @@ def _without_suspect(
     significant = _significant(e.misfit_breakdown)
     follows = _carrying(regression) or tuple(v.variable for v in significant)
     sizes = [v.share for v in significant]
-    sizes += [s.holdout_share for s in suspects if s.explains]
+    chi2, dof = e.fit.chi2, e.fit.dof
+    enough = [s for s in suspects if not is_misfit(chi2 - s.share * (chi2 - dof), dof)]
+    sizes += [s.holdout_share for s in suspects if s.explains and (s.sure or s in enough)]
     predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
     # A misfit that an effect of implausible size would explain is no noise either.
     patterns = [
         s.holdout_share
         for s in suspects
-        if not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM
+        if not s.plausible and s.sure and s.score.p_value * len(suspects) < FALSE_ALARM
     ]
     predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
     noise = judge_noise(e.fit, e.pure_error, predictable)
@@ -465,7 +468,7 @@ def _significant(breakdown: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
     """Variables that predict a share of the misfit worth naming, beyond chance among all."""
     predictors = _predictors(breakdown)
     alarm = FALSE_ALARM / max(len(predictors), 1)
-    return tuple(v for v in predictors if v.p_value < alarm and v.share >= LEAST_SHARE)
+    return tuple(v for v in predictors if v.p_value < alarm and v.sure and v.share >= LEAST_SHARE)
 
 
 def _predictors(breakdown: tuple[MisfitShare, ...]) -> list[MisfitShare]:

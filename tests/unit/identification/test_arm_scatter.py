@@ -208,6 +208,17 @@ def test_a_negligible_part_that_is_predictable_is_said(share, reason):
         assert ArmScatter.from_json(json.loads(json.dumps(d.scatter.to_json()))) == d.scatter
 
 
+@pytest.mark.parametrize(("sure", "reason"), [(False, "misjudged_noise"), (True, "no_suspect")])
+def test_what_chance_lets_a_variable_predict_is_no_missing_effect(sure, reason):
+    """Where the stated noise is wrong, tests that trust its covariance find variables by chance."""
+    e = Evidence(of_scattering())
+    scatter = replace(e.arm_scatter, std=tuple(100 * x for x in e.arm_scatter.std), size_m=1e-2)
+    vars(e).update(
+        arm_scatter=scatter, misfit_breakdown=(MisfitShare("joint 4 angle", 0.11, 1e-9, sure),)
+    )
+    assert judge(e, History()).reason == reason
+
+
 @pytest.mark.long
 @BOTH
 def test_a_noisier_instrument_is_not_the_arm(mode):
