@@ -10,10 +10,10 @@ The rules, in this order:
    `ambiguous`.
 3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
    replace an addition to the model.
-4. χ² is too large, and something recorded surely predicts a share of the misfit on poses left out, or
-   repeats of a pose have it in common: `unknown_effect`, with that share. If no variable predicts
-   it beyond chance, and it is the same under every load of a pose, more poses would identify it
-   (see `pose_alone`): `ambiguous`.
+4. χ² is too large, and something recorded surely predicts a share of the misfit on poses left out,
+   or repeats of a pose have it in common: `unknown_effect`, with that share. If no variable
+   predicts it beyond chance, and it is the same under every load of a pose, more poses would
+   identify it (see `pose_alone`): `ambiguous`.
 5. χ² is too large, the arm's own scatter is not in the stated covariance, and nothing predicts the
    residual (no suspect, no regression, no variable), or repeated readings scatter as much. The
    arm's scatter is then estimated (see `arm_scatter`), before rule 4:
