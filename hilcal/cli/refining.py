@@ -94,6 +94,10 @@ def _show_next_command(
     elif doubt:
         what, effects = "To plan the measurements that separate them:", list(doubt)
         line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
+    elif d.reason in ("background", "unconfirmed_suspect"):
+        t.show("To plan further poses:")
+        t.command(f"hilcal plan CELL.toml -o PLAN.json --after {quoted(run)}")
+        return
     else:
         return
     line += [] if revision is None else ["--revision", str(revision)]

@@ -186,6 +186,16 @@ def test_what_a_diagnosis_says(fitted, capsys):
     follow(capsys, said, f"hilcal add '{fitted}' hysteresis --revision 1")
 
 
+def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_path):
+    def judged(*args):
+        return replace(diagnose(*args), reason="background", suspects=())
+
+    monkeypatch.setattr("hilcal.cli.refining.judge", judged)
+    said = ok(capsys, "diagnose", fitted).out
+    step = f"hilcal plan CELL.toml -o PLAN.json --after '{fitted}'"
+    follow(capsys, said, step, **{"CELL.toml": CELL, "PLAN.json": tmp_path / "plan.json"})
+
+
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 
