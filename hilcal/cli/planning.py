@@ -104,6 +104,10 @@ def plan(
         if after is not None:
             with Campaign.open(after, catalogue, read_only=True) as run:
                 fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
+            config = robot_cell.configured()
+            if "readings" not in config.planning.model_fields_set:
+                config = config.with_keys("planning", readings=fitted.mode)
+                robot_cell = robot_cell.with_config(config)
         rng = np.random.default_rng(check_seed(seed))
         chosen = plan_readings(
             robot_cell, request, rng, fitted, say, catalogue, carried, reference=reference

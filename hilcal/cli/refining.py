@@ -96,7 +96,7 @@ def _show_next_command(
         line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
     elif d.reason in ("background", "unconfirmed_suspect"):
         t.show("To plan further poses:")
-        t.command(f"hilcal plan CELL.toml -o PLAN.json --after {quoted(run)}")
+        t.command(f"hilcal plan CELL.toml -o PLAN.json --after {quoted(run)} --quick")
         return
     else:
         return

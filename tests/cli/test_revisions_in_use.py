@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import from_text, to_text
-from tests.support.cli_cases import CELL, done, ok, table
+from tests.support.cli_cases import CELL, done, imported, ok, table
 from tests.support.cli_cases import run as command
 from tests.support.rows import first
 
@@ -130,6 +130,16 @@ def test_planning_on_takes_a_revision(run, cell, tmp_path, capsys):
     plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick")
     d = ok(capsys, *plan, "--after", run, "--revision", "2", "--json").document
     assert any("hysteresis" in name for name in d["predicted_std"])
+
+
+@pytest.mark.long
+def test_planning_on_plans_the_kind_of_readings_that_was_fitted(cell, tmp_path, capsys):
+    """The cell, which states no [planning] readings, has loads: deflections by default."""
+    path = imported(tmp_path / "absolute.hilcal")
+    ok(capsys, "identify", path, "--readings", "absolute")
+    plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick")
+    d = ok(capsys, *plan, "--after", path, "--json").document
+    assert d["criterion"] == "I"  # of deflections D
 
 
 @pytest.mark.long
