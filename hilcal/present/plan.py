@@ -283,8 +283,7 @@ def adding_lines(run: Path, plan: Path, cell: Path | None, appendable: bool) -> 
             f"hilcal run {quoted(config)} -o {quoted(run)} --append --plan {quoted(plan)}",
         )
     return (
-        "hilcal run did not measure the campaign: measure the states of the plan as its others, "
-        "append them to its table, each pose under a new name, and import the table again:",
+        "Add its readings to the table, each pose under a new name, and import that:",
         f"hilcal export {quoted(run)} --readings READINGS.csv",
         f"hilcal import READINGS.csv --config {quoted(config)} -o NEW.hilcal",
     )
