@@ -64,7 +64,6 @@ from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
 
-FOUND_ROWS = 12  # parameters of found effects that refine lists without --details
 MOST_GROSS = 20  # gross errors that compare names
 
 
@@ -244,8 +243,10 @@ def refine(
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(gross_error_lines(refinement.fit, details))
         found = set(refinement.fit.model.named) - set(model.names)
-        most = fit_words.ALL_ROWS if details else FOUND_ROWS
-        t.show(fit_words.parameters(refinement.fit, most, effects=found))
+        if details:
+            t.show(fit_words.parameters(refinement.fit, effects=found))
+        else:
+            t.show([*fit_words.strongest_parameters(refinement.fit, found), ""])
         t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")

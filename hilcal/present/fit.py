@@ -32,7 +32,7 @@ from hilcal.types import Ints
 
 ALL_ROWS, SCREEN_ROWS = 60, 6  # parameters in detail, and on the first screen
 PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
-MOST_STRONGEST, MOST_DIRECTIONS, MOST_GROSS, MOST_POSES = 5, 8, 8, 6
+MOST_SURE, MOST_STRONGEST, MOST_DIRECTIONS, MOST_GROSS, MOST_POSES = 3, 5, 8, 8, 6
 POSE = "pose"
 GROUPS: dict[Group, str] = {
     "joints": "{}",
@@ -151,6 +151,26 @@ def parameters(
     yield from families
     if undetermined:
         yield f"Not determined by these readings: {'; '.join(undetermined)}.\n"
+
+
+def strongest_parameters(fit: Fit, effects: Collection[str]) -> Iterator[str]:
+    """Yield for each effect its parameters that are most standard deviations from zero."""
+    for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
+        theta, std = fit.theta[s], fit.uncertainty.std[s]
+        known = np.flatnonzero(fit.uncertainty.identifiable[s] & (std > 0))
+        if effect.name not in effects or not len(known):
+            continue
+        if effect.groups() is not None:  # of its waves none may be sure, but their sum
+            yield _family(fit, effect, np.arange(s.start, s.stop)).rstrip()
+            continue
+        order = known[np.argsort(-np.abs(theta[known] / std[known]), kind="stable")]
+        parts = []
+        for k in order[:MOST_SURE].tolist():
+            p, value = effect.parameters[k], float(theta[k])
+            shown, plus_minus, unit = numbers.measured(p.unit, value, float(std[k]), [value])
+            parts.append(f"{p.name} {shown} ± {plus_minus} {unit}".rstrip())
+        more = f", and {len(known) - len(parts)} more" if len(known) > len(parts) else ""
+        yield f"{effect.name}: {', '.join(parts)}{more}."
 
 
 def _family(fit: Fit, effect: Effect, index: Ints) -> str:

@@ -15,7 +15,7 @@ from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.run_order import Ordering, PoseReadings, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.route import dry_run, route
+from hilcal.measuring.route import dry_run, durations, route
 from hilcal.store.plan import REFERENCE, UNLOADED, Step
 from tests.support.campaigns import configuration
 from tests.support.refusals import refusal_of
@@ -287,7 +287,8 @@ def _held_karp(w):
 def _seconds(count, seed, *, symmetric):
     rng = np.random.default_rng(seed)
     q = rng.uniform(-1.5, 1.5, (count + 1, 6))
-    w = pace(CONFIG).legs(q, q)
+    p = pace(CONFIG)
+    w = durations(q[:, None], q, p.speed, p.acceleration)
     blocked = rng.random(w.shape) < 0.2
     blocked = blocked | blocked.T if symmetric else blocked
     around = w[:, :1] + 6.5 + w[:1]

@@ -324,11 +324,11 @@ def test_what_the_pose_alone_predicts_is_said_so(shown):
     assert d.verdict == "unknown_effect"
     assert d.repeated_share > 0.9
     same = f"{100 * d.repeated_share:.0f} % of the misfit is the same"
-    assert f"{same} in them" in message(d)
-    # Had nothing recorded been significant:
-    alone = replace(d, predictable_share=0.0, follows=())
-    assert f"{same} when a pose is repeated: the pose itself predicts it" in message(alone)
-    assert "predicts 0 %" not in shown(*diagnosis_report(alone))
+    assert f"{same} when a pose is repeated: the pose itself predicts it" in message(d)
+    assert "predicts 0 %" not in shown(*diagnosis_report(d))
+    # Had an angle predicted a part of it:
+    partly = replace(d, predictable_share=0.1, follows=("joint 2 angle",))
+    assert f"{same} in them" in message(partly)
 
 
 def test_a_diagnosis_has_no_two_empty_lines_and_one_before_each_table(judged, printed):

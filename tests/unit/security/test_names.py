@@ -61,7 +61,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.rows import text_crc
-from hilcal.tables.files import open_grid, read_text
+from hilcal.tables.files import open_grid
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.proposal import Proposal
 from hilcal.tables.table import write_table
@@ -385,8 +385,8 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name):
     refused_or(lambda: read_points(path, ARM, {}).names[0], name, "points")
     path.write_bytes(as_csv(["pose", "load", *q], [name, said, *[0.1] * 6]))
     refused_or(lambda: read_points(path, ARM, {name.strip(): np.zeros(6)}) and name.strip(), name)
-    grid = as_csv(["a", "b"], [said, 1])
-    refused_or(lambda: read_text("g.csv", grid, FileFormat()).text("a")[0], name, "grid")
+    path.write_bytes(as_csv(["a", "b"], [said, 1]))
+    refused_or(lambda: open_grid(path, FileFormat()).text("a")[0], name, "grid")
     pq.write_table(pa.table({"pose": [name]}), folder / "p.parquet")
     refused_or(lambda: open_grid(folder / "p.parquet", FileFormat()).text("pose")[0], name)
     text = Plan((name,), np.zeros((1, 6)), (Step(name, "none"),)).to_json()
