@@ -85,22 +85,22 @@ def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None 
 def _show_next_command(
     t: Terminal, catalogue: Catalogue, run: Path, revision: int | None, d: Diagnosis
 ) -> None:
-    """Print the command that adds what is missing, or plans what separates the suspects."""
+    """Print the command that adds what is missing, or plans what tells more."""
     doubt = in_doubt(d)
     if d.verdict == "missing_effect" and d.lead is not None:
-        what, effects = "To add it, and see the error before and after:", [d.lead.effect]
+        doubt, what = (d.lead.effect,), "To add it, and see the error before and after:"
         line = ["hilcal", "add", quoted(run), quoted(d.lead.effect)]
     elif doubt:
-        what, effects = "To plan the measurements that separate them:", list(doubt)
+        what = "To plan the measurements that separate them:"
         line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
     elif d.reason in ("background", "unconfirmed_suspect"):
-        t.show("To plan further poses:")
-        t.command(f"hilcal plan CELL.toml -o PLAN.json --after {quoted(run)} --quick")
-        return
+        what = "To plan further poses:"
+        line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run), "--quick"]
     else:
         return
     line += [] if revision is None else ["--revision", str(revision)]
-    for path in {f.path for f in map(catalogue.file_of, effects) if f is not None}:
+    files = (catalogue.file_of(name) for name in (*d.fit.model.names, *doubt))
+    for path in dict.fromkeys(f.path for f in files if f is not None):
         line += ["--effects-from", quoted(path)]
     t.show(what)
     t.command(" ".join(line))

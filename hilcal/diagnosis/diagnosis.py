@@ -16,7 +16,7 @@ from hilcal.diagnosis.evidence import (
     Alternative,
     Insufficiency,
     Separability,
-    is_misfit,
+    would_leave_noise,
 )
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import NoiseVerdict, PureError
@@ -175,12 +175,11 @@ class Diagnosis(Shown, Tabular):
     @property
     def unconfirmed(self) -> tuple[Suspect, ...]:
         """Suspects each of which would leave noise, without surely predicting poses left out."""
-        misfit, dof = self.fit.chi2 - self.fit.dof, self.fit.dof
         return tuple(
             s
             for s in self.suspects
             if s.explains and s.plausible and s.keeps and not (s.refuted or s.sure)
-            if not is_misfit(dof + (1.0 - s.share) * misfit, dof)
+            if would_leave_noise(self.fit, s.share)
         )
 
     @property

@@ -106,6 +106,11 @@ def is_misfit(square: float, dof: float) -> bool:
     return float(scipy.stats.chi2.sf(square, dof)) < MISFIT_ALARM
 
 
+def would_leave_noise(fit: Fit, share: float) -> bool:
+    """Whether an effect that explains a share of the misfit would leave noise alone."""
+    return not is_misfit(fit.chi2 - share * (fit.chi2 - fit.dof), fit.dof)
+
+
 @dataclass(frozen=True, slots=True)
 class Alternative:
     """Other effects that could replace an effect of the model."""
@@ -284,8 +289,8 @@ class Evidence:
     def suspects(self, rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
         """Return `effects`, scored; best first, see `ranked`.
 
-        A refit decides where the exact model loses the promise of the linearisation; not of a
-        suspect that leaves the lead to another one in any case.
+        Where the exact model at the promised step explains much less than the linear one, a refit
+        decides; only of suspects that could be the first or inseparable from it, for time.
         """
         while True:
             kept = (replace(s, kept=self._kept.get(s.effect, s.kept)) for s in self._scored)

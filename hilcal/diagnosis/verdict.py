@@ -69,8 +69,8 @@ from hilcal.diagnosis.evidence import (
     Evidence,
     Insufficiency,
     Separability,
-    is_misfit,
     separability,
+    would_leave_noise,
 )
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import (
@@ -363,9 +363,11 @@ def _without_suspect(
     significant = _significant(e.misfit_breakdown)
     follows = _carrying(regression) or tuple(v.variable for v in significant)
     sizes = [v.share for v in significant]
-    chi2, dof = e.fit.chi2, e.fit.dof
-    enough = [s for s in suspects if not is_misfit(chi2 - s.share * (chi2 - dof), dof)]
-    sizes += [s.holdout_share for s in suspects if s.explains and (s.sure or s in enough)]
+    sizes += [
+        s.holdout_share
+        for s in suspects
+        if s.explains and (s.sure or would_leave_noise(e.fit, s.share))
+    ]
     predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
     # A misfit that an effect of implausible size would explain is no noise either.
     patterns = [
