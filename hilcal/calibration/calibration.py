@@ -120,7 +120,6 @@ class Calibration(Brief):
         std = np.sqrt(np.diagonal(p.covariance))
         std = np.where(std > 0.0, std, 1.0)  # units differ: a target's place, a gear's compliance
         values, vectors = np.linalg.eigh(p.covariance / (std[:, None] * std))
-        noise = np.trace(p.noise_covariance(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
         kappa = position_factor(p, fit.holdout.rms_m)
         # A deflection is the difference of two readings.
         readings = 2 if fit.mode == "deflection" else 1
@@ -136,7 +135,7 @@ class Calibration(Brief):
             root=std[:, None] * vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
             scatter=scatter_of(fit),
-            measured=MeasuredRanges.of(used.states, p, noise, model.cell.arm.units),
+            measured=MeasuredRanges.of(used.states, p, kappa, model.cell.arm.units),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),

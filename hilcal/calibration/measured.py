@@ -22,7 +22,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.identification.prediction.predictive import Predictive
-from hilcal.identification.prediction.validation import FAR
+from hilcal.identification.prediction.validation import POSITION_STD, farthest_m2
 from hilcal.measuring.force import shift
 from hilcal.model.model import Model
 from hilcal.readings.readings import (
@@ -59,14 +59,10 @@ class MeasuredRanges:
 
     @classmethod
     def of(
-        cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]
+        cls, states: States, p: Predictive, kappa: float, units: Sequence[str]
     ) -> "MeasuredRanges":
-        """Return the ranges of fitted states.
-
-        `noise` (D,) are traces of the measurements' position covariances by noise and misfit, m².
-        """
-        spread = noise * p.leverage / (1 - p.leverage)
-        return cls(ranges_of(states, units), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
+        """Return the ranges of fitted states; `kappa` is the factor of the covariance C."""
+        return cls(ranges_of(states, units), float(np.sqrt(kappa * farthest_m2(p))))
 
     def mid_range_q(self, n: int) -> Floats:
         """(n,) joint values in the middle of their ranges, rad or m; zero where unknown."""
@@ -88,7 +84,7 @@ class MeasuredRanges:
             if name in ranges
         ]
         if std_m is not None:
-            limit = Range("standard deviation of the position", "m", 0.0, self.most_std_m)
+            limit = Range(POSITION_STD, "m", 0.0, self.most_std_m)
             outside.append(Outside(limit, std_m > self.most_std_m, std_m))
         return [o for o in outside if o.points.any()]
 

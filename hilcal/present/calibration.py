@@ -406,8 +406,8 @@ def validation_report(
 
 
 def _beyond(v: validation.ExceededRange) -> str:
-    if v.variable == "leverage":
-        return f"leverage: {v.count}, far from all fitted poses in several joints together"
+    if v.variable == validation.POSITION_STD:
+        return f"{v.count} are far from all fitted poses in several joints together"
     if v.unit == "rad":
         low, high, most = (f"{np.degrees(x):.0f}°" for x in (v.low, v.high, v.most))
     else:

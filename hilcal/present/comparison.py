@@ -7,6 +7,7 @@ from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.carried.posterior import Differences
+from hilcal.identification.prediction.validation import POSITION_STD
 from hilcal.names import quoted
 from hilcal.present.document import Block, Table, Words, heading, note, table
 from hilcal.present.fit import error_words, measurements
@@ -81,8 +82,8 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
         f"The error is {numbers.digits(t.z, 2)} times the stated one, correlations included "
         f"({numbers.p_equals(t.p_value)}): {'no ' * (t.p_value >= LEVEL)}more than its uncertainty."
     )
-    # The expected error includes the distance of the poses from the measured ones (leverage).
-    variables = (v for v in t.beyond.variables if v.variable != "leverage")
+    # The expected error includes the distance of the poses from the measured ones (`POSITION_STD`).
+    variables = (v for v in t.beyond.variables if v.variable != POSITION_STD)
     if ranges := numbers.few([f"{v.variable} ({v.count})" for v in variables], 3):
         yield f"Outside the range of {earlier}: {ranges}; an error there need not be a change."
 
@@ -168,7 +169,7 @@ def _remainder(c: Comparison) -> str:
     changes, scatter = c.changes, numbers.digits(c.changes.scatter, 2)
     if changes.explained:
         return f"What is left after that is scatter as stated ({scatter} times)."
-    outside = any(v.variable != "leverage" for v in c.today.beyond.variables)
+    outside = any(v.variable != POSITION_STD for v in c.today.beyond.variables)
     extrapolated = ", or the earlier model is wrong where it was not measured" * outside
     return (
         f"What is left is {scatter} times the stated scatter "

@@ -64,12 +64,10 @@ from hilcal.types import Floats, Ints
 
 ITERATIONS = 20  # of the noise factor; it converges within a few
 MOST_ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
-MOST_LEVERAGE = 0.99  # of a row; that of a row which alone determines something is 1
 ROUNDING = 1e-9  # least share of a direction's information that is not of one fold
 FRAMES_FREEDOM = 10.0
 """Prior of frames without one, in units of that of other frames; a choice: half a percent of the
 motion of these is lost."""
-CHUNK = 4096  # measurements that are processed at once, for memory
 MOST_ROWS = 600  # elements beyond which variances count as known: of 200 poses of a real UR10
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
 DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.19 to 1.43 by seed
@@ -186,8 +184,8 @@ class Predictive:
     noise: float  # σ², noise factor of the fitted readings in units of W
     factor: float  # κ
     least_factor: float  # lower bound of κ, by the uncertainty of the variances
-    leverage: Floats  # (D,) largest eigenvalue of the variance of a fitted measurement's prediction
-    # over that of the noise
+    pose_m2: Floats  # (D,) variance of a fitted 3-D position's prediction, by the parameters alone,
+    # from the readings at other poses, m²
     scatter: float  # mean variance of the fitted readings by σ² W, in units of V
     left_out: float  # mean variance of the predictions of poses left out by C, in units of V
     scatter_m2: float  # `scatter` of a 3-D position, m²
@@ -205,6 +203,11 @@ class Predictive:
         jacobian = w.raw(derivative(self.model, prediction, self.theta, w.m, w.mode))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
         return np.asarray(self.factor * spread)
+
+    def position_m2(self, prediction: Prediction, w: Whitening) -> Floats:
+        """Return tr J C Jᵀ (D,) of predicted 3-D positions, m², as `pose_m2` of the fitted ones."""
+        j = w.raw(derivative(self.model, prediction, self.theta, 3, w.mode))
+        return np.asarray(np.einsum("dip,pq,diq->d", j, self.covariance, j, optimize=True))
 
     def reading_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ (σ² W + J C Jᵀ) (D, m, m), of measured minus predicted."""
@@ -233,7 +236,8 @@ def predictive(
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
-    fold = random_folds(distinct_poses(fitted)[stated.reading])
+    pose = distinct_poses(fitted)[stated.reading]
+    fold = random_folds(pose)
     noise_factor, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
     if model.background:
         variances = mixed_fit_at(model, fitted, mode, theta)
@@ -285,11 +289,6 @@ def predictive(
         half = Excess(middle, float(np.sqrt(new.attitude * extra.attitude)))
         extra = new if step == 0 else half
         w = whitening(extra.of_readings(fitted, mode), mode, "gc")
-    shares = []
-    for k in range(0, len(a), CHUNK * w.m):
-        part = (a[k : k + CHUNK * w.m] @ root).reshape(-1, w.m, len(root))
-        shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
-    leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
     scatter, b, wider = noise, a, extra.widened(stated.covariance)
     if not extra.is_zero:
         share = np.trace(np.linalg.solve(stated.covariance, wider), axis1=1, axis2=2)
@@ -298,41 +297,49 @@ def predictive(
     position = w.raw(derivative(model, prediction, theta, 3, mode)).reshape(-1, model.size)
     position = space.columns(position) * std
     rows, points = w.rows_of(fold), np.repeat(fold, 3)
-    left_out, left_out_m2 = left_out_variances(
-        a, rows, ((b, rows), (position, points)), root, noise
+    left_out, left_out_m2 = (
+        float(v.mean())
+        for v in left_out_variances(a, rows, ((b, rows), (position, points)), root, noise)
     )
+    (of_pose,) = left_out_variances(
+        a, w.rows_of(pose), ((position, np.repeat(pose, 3)),), root, noise
+    )
+    by_pose = of_pose.reshape(-1, 3).sum(axis=1)
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
         model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), extra, noise,
         factor, least,
-        leverage, scatter, left_out, scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
+        by_pose, scatter, left_out, scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
     )  # fmt: skip
 
 
 def left_out_variances(
     a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
-) -> list[float]:
-    """Return the mean variance of each set of `predicted` rows, each row without its own fold.
+) -> list[Floats]:
+    """Return the variances of each set of `predicted` rows (R',), each row without its own fold.
 
     A set is rows (R', P) with their folds (R',). `a` (R, P) are the fitted rows in units of W, and
     `fold` (R,) their folds; `root` (P, K) is the root of C, and `noise` is σ².
     """
-    total = np.zeros(len(predicted))
+    out, moved = [np.zeros(len(b)) for b, _ in predicted], [b @ root for b, _ in predicted]
+    fitted = a @ root
     for f in range(int(fold.max(initial=-1)) + 1):
-        x = a[fold == f] @ root
+        x = fitted[fold == f]
         few = len(x) < len(root)
         values, vectors = np.linalg.eigh(x @ x.T if few else x.T @ x)
         remainder = np.maximum(1.0 - values / noise, ROUNDING)
-        for k, (b, folds) in enumerate(predicted):
-            y = b[folds == f] @ root
+        for k, (_, folds) in enumerate(predicted):
+            chosen = folds == f
+            y = moved[k][chosen]
             if few:
                 along = y @ (x.T @ vectors)
-                total[k] += np.sum(y**2) + np.sum(along**2 / (noise * remainder))
+                variance = np.sum(y**2, axis=1) + np.sum(along**2 / (noise * remainder), axis=1)
             else:
-                total[k] += np.sum((y @ vectors) ** 2 / remainder)
-    return [float(t) / max(len(b), 1) for t, (b, _) in zip(total, predicted, strict=True)]
+                variance = np.sum((y @ vectors) ** 2 / remainder, axis=1)
+            out[k][chosen] = variance
+    return out
 
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:

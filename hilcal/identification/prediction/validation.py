@@ -4,9 +4,8 @@ A model may be wrong wherever nothing was measured, however well it predicts pos
 those that were. A reading is outside where one of its variables exceeds the range of the fitted
 readings by more than `MARGIN` of that range; angles count modulo whole turns, unless the model
 distinguishes these (`whole_turns`). Joint angles inside of their ranges can be far from all fitted
-ones as well; then the leverage of a reading is large: the variance of its prediction over
-that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
-fitted measurements, each predicted without itself.
+ones as well; then the variance tr J C Jᵀ of a predicted position, by the parameters alone, is
+large, compared with that of fitted positions, each predicted without the readings of its pose.
 """
 
 from collections.abc import Sequence
@@ -31,9 +30,11 @@ from hilcal.types import Bools, Floats, Ints
 
 STEPS = 10  # most Gauss-Newton steps of a registration; a choice
 CONVERGED = 1e-6  # step of a registration that ends it, in σ per whitened element; a choice
-# leverage from which a reading is outside, in units of that which one in a hundred of the fitted
-# measurements exceeds; a choice
+# variance by the parameters alone from which a reading is outside, in units of that which one in a
+# hundred of the fitted measurements exceeds; a choice
 FAR = 2.0
+POSITION_STD = "standard deviation of the position"
+"""Name of the variable that tells points far from all fitted poses in several joints together."""
 BAND = 0.95  # probability of the band that is stated, as is usual (GUM)
 
 
@@ -184,10 +185,10 @@ def set_up_anew(p: Predictive, fitted: Readings, other: Readings, mode: Mode) ->
 class ExceededRange:
     """Readings beyond the fitted range of one variable."""
 
-    variable: str  # e.g. "joint 2 angle", "force", "leverage"
+    variable: str  # e.g. "joint 2 angle", "force", `POSITION_STD`
     unit: str  # SI
     low: float  # smallest fitted value
-    high: float  # largest fitted value; of the leverage, the limit
+    high: float  # largest fitted value; of `POSITION_STD`, the limit
     count: int  # number of measurements beyond
     most: float  # how far the farthest is beyond
 
@@ -228,6 +229,11 @@ class Extrapolation:
         }
 
 
+def farthest_m2(p: Predictive) -> float:
+    """Return the variance of a position, by the parameters alone, from which it is outside, m²."""
+    return FAR * float(np.quantile(p.pose_m2, 0.99))
+
+
 def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
@@ -239,8 +245,6 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
     prediction = p.model.predict(readings.states, p.theta)
     spread = p.prediction_covariance(prediction, w)
     noise = p.noise_covariance(p.noise_whitening(readings, w.mode))
-    root = whitening_matrix(noise)
-    leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)
     ranges = {r.variable: r for r in ranges_of(fitted.states, units)}
     turning = turning_variables(whole_turns(p.model, p.theta))
@@ -253,11 +257,12 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
             most = float(r.over(x[far], turning=turns).max())
             beyond.append(ExceededRange(name, unit, r.low, r.high, int(far.sum()), most))
         outside |= far
-    limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
-    far = leverage > max(limit, 1e-12)
+    by_parameters = np.sqrt(p.factor * p.position_m2(prediction, w))
+    limit = float(np.sqrt(p.factor * farthest_m2(p)))
+    far = by_parameters > max(limit, 1e-12)
     if far.any():
-        most = float(leverage.max() - limit)
-        beyond.append(ExceededRange("leverage", "1", 0.0, limit, int(far.sum()), most))
+        most = float(by_parameters.max() - limit)
+        beyond.append(ExceededRange(POSITION_STD, "m", 0.0, limit, int(far.sum()), most))
     outside |= far
     total = spread + noise
     square, read = _squares(total, raw)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.diagnosis.stepwise import add, predicts_better
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -19,7 +20,12 @@ from hilcal.identification.folds import (
 )
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.prediction.predictive import Excess, excess, predictive_of
-from hilcal.identification.prediction.validation import extrapolation, set_up_anew, validate
+from hilcal.identification.prediction.validation import (
+    POSITION_STD,
+    extrapolation,
+    set_up_anew,
+    validate,
+)
 from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
@@ -211,6 +217,21 @@ def split(seed, joint):
     found = fitted_model(c.cell, r[first], "absolute", ("joint_compliance", "transmission_error"))
     other = validate(found.model, found.theta, found.readings, r[~first], "absolute")
     return found, other, extrapolation(predictive_of(found), found.readings, other)
+
+
+def test_several_loads_at_a_pose_do_not_make_fresh_poses_outside():
+    c = campaign("transmission_error", "absolute", 0, plan_seed=5, poses=50, strength=3.0)
+    fitted = c.readings.pose % 2 == 0
+    found = fitted_model(
+        c.cell, c.readings[fitted], "absolute", ("joint_compliance", "transmission_error")
+    )
+    fresh = c.readings[~fitted]
+    other = validate(found.model, found.theta, found.readings, fresh, "absolute")
+    by_pose = extrapolation(predictive_of(found), found.readings, other).variables
+    assert not any(v.variable == POSITION_STD and v.count > 0.1 * len(fresh) for v in by_pose)
+    points = Calibration.of(found).predict(fresh.states.q, fresh.states.wrench)
+    alone = [o for o in points.outside if o.range.variable == POSITION_STD]
+    assert not any(o.points.mean() > 0.1 for o in alone)
 
 
 def rms(z):
