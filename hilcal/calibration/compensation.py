@@ -313,7 +313,7 @@ class Compensation(Tabular):
         return {
             "points": f"{len(self.q)}, of which {np.count_nonzero(self.inverse.solved)} are solved",
             "q": f"array {self.q.shape}, rad, of joints that slide m",
-            "more": "q, before, after, usable, inside, limits, singular, to_frame(), to_dict()",
+            "more": "q, before, after, usable, inside, singular, other_branch, limits, to_frame()",
         }
 
     @property
@@ -357,10 +357,26 @@ class Compensation(Tabular):
     @cached_property
     def singular(self) -> Bools:
         """(N,) whether the pose is singular."""
-        arm = self._tool.model.cell.arm
-        jacobian = _jacobian(arm, evaluate(arm, self.q), self.after.position)
-        s = np.linalg.svd(jacobian[..., arm.independent], compute_uv=False)
+        s = np.linalg.svd(self._nominal_jacobian(self.q), compute_uv=False)
         return np.asarray(s[:, -1] < MIN_SINGULAR_RATIO * s[:, 0])
+
+    @cached_property
+    def other_branch(self) -> Bools:
+        """(N,) whether a singular pose lies between commanded and corrected joint values.
+
+        The arm then has another configuration, as an elbow that is bent the other way: the sign of
+        the determinant of the Jacobian differs. Only of arms with six independent joints.
+        """
+        given, corrected = self._nominal_jacobian(self.given), self._nominal_jacobian(self.q)
+        if corrected.shape[1] != corrected.shape[2]:
+            return np.zeros(len(self.q), dtype=np.bool_)
+        return np.asarray(np.linalg.det(given) * np.linalg.det(corrected) < 0.0)
+
+    def _nominal_jacobian(self, q: Floats) -> Floats:
+        """(N, 6, k) derivative of the nominal arm's tool by its k independent joints."""
+        arm = self._tool.model.cell.arm
+        chain = evaluate(arm, q)
+        return _jacobian(arm, chain, chain.point(self._tool.nominal[:3, 3]))[..., arm.independent]
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
@@ -374,8 +390,9 @@ class Compensation(Tabular):
 
     @property
     def usable(self) -> Bools:
-        """(N,) points that are solved, not singular, within limits and measured ranges."""
-        good = self.inverse.solved & ~self.singular & ~self.limits.any(axis=1)
+        """(N,) points that are solved on their branch, not singular, within limits and ranges."""
+        solved = self.inverse.solved & ~self.singular & ~self.other_branch
+        good = solved & ~self.limits.any(axis=1)
         return np.asarray(good & self.inside)
 
     @cached_property

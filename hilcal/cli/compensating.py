@@ -27,6 +27,7 @@ from hilcal.names import csv_text
 from hilcal.numbers import length
 from hilcal.present.calibration import (
     compensation_report,
+    far_turned,
     refusals,
     refuted_line,
     waypoint_outcomes,
@@ -151,6 +152,7 @@ def compensate(
     retained = [k for k, why in enumerate(refused) if not why]
     if not options.leave or not retained:
         wrong = ~result.inverse.solved | result.singular | result.limits.any(axis=1)
+        wrong |= result.other_branch
         _refuse(points, targets.names, refused, wrong | np.array(unclear, bool))
     elif any(refused):
         q, task = q[retained], _only(task, retained, refused)
@@ -175,6 +177,7 @@ def compensate(
         _other_payload(task, wrench, cell),
         _other_gravity(task, cell),
         _not_allowed(cell, names, result.q, loads),
+        far_turned(names, q, result),
     )
     for caution in filter(None, cautions):
         t.notice(f"warning: {points}: {caution}")

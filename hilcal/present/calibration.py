@@ -60,6 +60,7 @@ REFUTED = (
 )
 MOST_NOT_CORRECTED, MOST_POINTS = 6, 12  # listed points: without a correction, compensated
 MOST_VARIABLES, MOST_POSES = 4, 6  # listed variables; listed poses
+FAR_TURN_RAD = np.radians(5.0)  # correction of a joint that is warned of; arms' errors are 0.1°
 MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDE_RATIO = 1.5
@@ -227,6 +228,8 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
             why.append(f"cannot be reached on its branch, {residual} are left")
         if c.singular[k]:
             why.append("the pose is singular")
+        if c.other_branch[k]:
+            why.append("its correction lies beyond a singular pose: elbow or wrist would flip")
         for j in np.flatnonzero(c.limits[k]):
             value = numbers.joint_value(c.q[k, j], c.units[j])
             why.append(f"joint {j + 1} would be beyond its limit ({value})")
@@ -286,6 +289,22 @@ def compensation_report(
         )
     if len(names) > MOST_POINTS:
         yield f"The {MOST_POINTS} of {len(names)} points with the largest error before are listed."
+
+
+def far_turned(names: Sequence[str], given: Floats, c: Compensation) -> str:
+    """Return which correction turns a joint farthest, beyond `FAR_TURN_RAD`; "" where none does."""
+    turns = np.where(np.array(c.units) == "rad", np.abs(c.q - given), 0.0)
+    far = turns.max(axis=1) > FAR_TURN_RAD
+    if not far.any():
+        return ""
+    k, joint = np.unravel_index(int(np.argmax(turns)), turns.shape)
+    more = f" (of {far.sum()} points by over {np.degrees(FAR_TURN_RAD):.0f}°)"
+    more = more if far.sum() > 1 else ""
+    turn = numbers.joint_value(float(turns[k, joint]), "rad")
+    return (
+        f"the correction of {names[int(k)]} turns joint {joint + 1} by {turn}{more}: close to a "
+        "singular pose a small correction turns joints far; check the motion there"
+    )
 
 
 def refuted_line(calibration: Calibration, path: Path, run: Path, validation: Path) -> str:

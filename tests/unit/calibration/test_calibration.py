@@ -1,6 +1,7 @@
 """A calibration: predicted and compensated poses against the world's own mechanics."""
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -18,6 +19,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
+from hilcal.present.calibration import far_turned, refusals
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
@@ -218,6 +220,29 @@ def test_points_outside_of_what_was_measured_are_named():
     found = {o.range.variable: o.points.tolist() for o in p.outside}
     assert found["joint 3 angle"] == [False, True]
     assert found["force"] == [True, False]
+
+
+def test_a_correction_that_bends_the_elbow_the_other_way_is_refused():
+    """The corrected pose lies on the other side of the stretched arm."""
+    c, states = calibrated("link_geometry"), fresh()
+    q = states.q.copy()
+    q[:20, 2] = 3e-4
+    k = c.compensate(q, states.wrench)
+    bent = k.inverse.solved & (k.q[:, 2] * q[:, 2] < 0.0)
+    assert bent.sum() > 2
+    np.testing.assert_array_equal(k.other_branch[k.inverse.solved], bent[k.inverse.solved])
+    assert not k.usable[bent].any()
+    why = refusals(k, allowed_outside=True)
+    assert all("elbow or wrist would flip" in why[i] for i in np.flatnonzero(bent))
+
+
+def test_a_correction_that_turns_a_joint_far_is_told():
+    c, states = calibrated("joint_tilt_compliance"), fresh()
+    q, names = states.q[:20].copy(), ["point"] * 20
+    assert far_turned(names, q, c.compensate(q, states.wrench[:20])) == ""
+    q[:, 4] = 2e-3  # the wrist is nearly straight
+    told = far_turned(names, q, c.compensate(q, states.wrench[:20]))
+    assert re.match(r"the correction of point turns joint [46] by \d+\.\d°", told)
 
 
 def test_wrong_input_is_refused_in_words():
