@@ -40,6 +40,7 @@ from hilcal.present import diagnosis as words
 from hilcal.present import fit as fit_words
 from hilcal.present.calibration import (
     fit_and_test_lines,
+    next_of,
     shares_report,
     validation_failure,
     validation_report,
@@ -473,6 +474,10 @@ def validate(
     t.show(fit_and_test_lines(judged, prediction))
     t.show(validation_report(judged, prediction, result.beyond))
     t.show(shares_report(shares))
+    if step := next_of(prediction, result.beyond):
+        files = f"{quoted(run)} {quoted(other)}"
+        lines = {"register": f"validate {files} --register", "compare": f"compare {files}"}
+        t.command(f"hilcal {lines[step]}")
     if result.tool:
         t.show(tool_differs(result.tool, other.name))
     failed: HilcalError | None = None

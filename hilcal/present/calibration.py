@@ -24,7 +24,7 @@ from hilcal.present.progress import duration_text
 from hilcal.present.registration import base_line
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
 from hilcal.readings.whitening import Mode
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 if TYPE_CHECKING:
     from hilcal.procedure.next_plan import Decision
@@ -62,6 +62,11 @@ MOST_NOT_CORRECTED, MOST_POINTS = 6, 12  # listed points: without a correction, 
 MOST_VARIABLES, MOST_POSES = 4, 6  # listed variables; listed poses
 FAR_TURN_RAD = np.radians(5.0)  # correction of a joint that is warned of; arms' errors are 0.1°
 MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
+FEW = 0.05  # largest share of measurements that can be gross errors of a validation; a choice
+NEXT = {
+    "register": "If the tracker was moved before these readings: --register fits its place first.",
+    "compare": "hilcal compare RUN OTHER says what has changed.",
+}
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDE_RATIO = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
@@ -418,10 +423,39 @@ def validation_report(
         yield _as_far_off(z_all)
     if test.registered:
         yield "The place of the tracker was fitted to these readings (--register).\n"
-        if z_all > MIN_ERROR_RATIO:
-            yield "hilcal compare RUN OTHER says what has changed.\n"
-    elif z_all > MOVED_TRACKER_RATIO:
-        yield ("If the tracker was moved before these readings: --register fits its place first.\n")
+    if step := next_of(test, beyond):
+        yield f"{NEXT[step]}\n"
+    if (few := _far_alone(beyond)).any():
+        yield _alone(test, beyond, few)
+
+
+def next_of(test: validation.Validation, beyond: validation.Extrapolation) -> str:
+    """Return what tells why readings are off: "register", "compare", or "" where nothing need."""
+    z = _rms(beyond.z)
+    if z <= MIN_ERROR_RATIO or _far_alone(beyond).any():
+        return ""
+    return "register" if z > MOVED_TRACKER_RATIO and not test.registered else "compare"
+
+
+def _far_alone(beyond: validation.Extrapolation) -> Bools:
+    """Return the few measurements (D,) that are far off while all others are as stated."""
+    far = beyond.z > MOVED_TRACKER_RATIO
+    few = 0 < far.sum() <= max(1.0, FEW * len(far)) and not far.all()
+    return far if few and _rms(beyond.z[~far]) <= MIN_ERROR_RATIO else np.zeros_like(far)
+
+
+def _alone(test: validation.Validation, beyond: validation.Extrapolation, far: Bools) -> str:
+    r, rows = test.readings, test.whitening.reading
+    listed = [
+        f"{r.pose_names[r.pose[rows[k]]]}/{r.load_names[r.load[rows[k]]]} ({beyond.z[k]:.0f} times)"
+        for k in np.flatnonzero(far)[np.argsort(-beyond.z[far])]
+    ]
+    rest = np.sqrt(np.mean(np.sum(test.raw[~far, :3] ** 2, axis=1)))
+    return (
+        f"That is due to {numbers.few(listed, 3)} alone; the error of the {(~far).sum()} others is "
+        f"{length(float(rest))} rms, {_rms(beyond.z[~far]):.2f} times the stated one: a gross "
+        "error? Measure it again.\n"
+    )
 
 
 def _beyond(v: validation.ExceededRange) -> str:

@@ -133,6 +133,33 @@ def test_another_reflector_is_predicted_where_the_other_cell_has_it(tmp_path, ca
     assert "[tool] target_m of b.hilcal differ; those of b.hilcal" in ok(capsys, *arguments).out
 
 
+def test_a_gross_error_of_one_reading_is_not_taken_for_a_moved_tracker(folder, tables, capsys):
+    """With the tracker moved, or the arm changed, the command that tells comes last and works."""
+    fit, other = folder / "fit.hilcal", folder / "other.hilcal"
+    with (tables / "rest.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    k = next(k for k, row in enumerate(rows) if row["load"] == "10kg")
+
+    def told(shift_m):
+        for row, shift in zip(rows, shift_m, strict=True):
+            row["x_m"] = str(float(row["x_m"]) + shift)
+        with (folder / "other.csv").open("w", encoding="utf-8", newline="") as stream:
+            out = csv.DictWriter(stream, rows[0].keys())
+            out.writeheader()
+            out.writerows(rows)
+        ok(capsys, "import", folder / "other.csv", "--config", CELL, "-o", other, "--force")
+        return ok(capsys, "validate", fit, other).out
+
+    once = told([5e-3 * (i == k) for i in range(len(rows))])
+    assert f"due to {rows[k]['pose']}/10kg (" in once
+    assert "gross error? Measure it again" in " ".join(once.split())
+    assert "--register" not in once
+    loaded = [row["load"] != "none" for row in rows]
+    all_of_them = told([1e-3 * x for x in loaded])
+    assert "gross error" not in all_of_them
+    assert all_of_them.rstrip().endswith(f"hilcal validate {fit} {other} --register")
+
+
 def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):
     arguments = ("validate", folder / "fit.hilcal", folder / "rest.hilcal")
     kept = ok(capsys, *arguments, "--limit", "1 mm", "--json").document
