@@ -62,6 +62,7 @@ from hilcal.refinement import refine as refine_model
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
+from hilcal.transfer.compare import other_serial_number
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
 
@@ -404,6 +405,8 @@ def compare(
     ):
         if o.in_use(revision) is None:
             t.notice(f"{run}: no revision yet, using the baseline; hilcal refine makes a model")
+        if warning := other_serial_number(o, later_run):
+            t.notice(f"warning: {warning}")
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=same_setup or None, say=say
         )
@@ -466,6 +469,8 @@ def validate(
         Campaign.open(other, read_only=True) as unseen,
         working(t.progress) as say,
     ):
+        if warning := other_serial_number(o, unseen):
+            t.notice(f"warning: {warning}")
         record = fitting.record_of(t, o, say, revision)
         result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
         name = model_name(fitting.effect_titles(result.model, o.fitted_readings(record)))

@@ -52,6 +52,7 @@ from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.factory import FactoryKinematics, with_factory
 from hilcal.shown import Shown
 from hilcal.store.revision import CARRIED, RevisionRecord
+from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Bools
 
 LEVEL = 1e-3
@@ -264,6 +265,19 @@ def validate(
     beyond = extrapolation(knows, fitted, prediction)
     shares = acceptance(prediction, beyond, limit_m)
     return CampaignValidation(model, judged, prediction, beyond, shares, tool)
+
+
+def other_serial_number(first: Campaign, second: Campaign) -> str:
+    """Return that two campaigns are of arms with different serial numbers; "" where not known."""
+    if any(c.file.about(PLAN) is None for c in (first, second)):  # imported
+        return ""
+    one, two = (RunLog(c.file).serial_number() for c in (first, second))
+    if not one or not two or one == two:
+        return ""
+    return (
+        f"{second.path}: the serial number of its arm is {two}, that of {first.path} is {one}: "
+        "what differs may be the arm"
+    )
 
 
 def _tool_differs(first: Campaign, second: Campaign) -> tuple[str, ...]:

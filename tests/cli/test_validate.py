@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import PLAN, SERIAL_NUMBER
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, run
 from tests.support.foreign_tables import MOUNT, OFFSET, campaign, lines, write
@@ -81,8 +84,6 @@ def test_of_a_mixture_only_the_unseen_readings_are_judged(folder, capsys):
 
 
 def test_readings_that_came_after_a_revision_are_unseen_by_it(folder, capsys):
-    from hilcal.store.campaign_file import CampaignFile
-
     fit = folder / "fit.hilcal"
     with CampaignFile.open(folder / "rest.hilcal") as rest, CampaignFile.open(fit) as file:
         file.append_readings(rest.readings())
@@ -158,6 +159,21 @@ def test_a_gross_error_of_one_reading_is_not_taken_for_a_moved_tracker(folder, t
     all_of_them = told([1e-3 * x for x in loaded])
     assert "gross error" not in all_of_them
     assert all_of_them.rstrip().endswith(f"hilcal validate {fit} {other} --register")
+
+
+def test_readings_of_an_arm_of_another_serial_number_are_told(folder, capsys):
+    paths, plan = [], Plan(("p1",), np.zeros((1, 6)), (Step("p1", "none", 0),))
+    for name, number in (("fit", "20235500001"), ("rest", "20235500002"), ("all", "20235500001")):
+        with CampaignFile.open(folder / f"{name}.hilcal", read_only=True) as file:
+            texts = {**file.texts(), PLAN: plan.to_json(), SERIAL_NUMBER: number}
+            readings = file.readings()
+        about = (texts.pop(key) for key in ("config", "base_dir", "source"))
+        paths.append(folder / f"{name} numbered.hilcal")
+        CampaignFile.create(paths[-1], *about, more_texts=texts, readings=readings).close()
+    for command in ("validate", "compare"):
+        said = " ".join(ok(capsys, command, paths[0], paths[1]).err.split())
+        assert "serial number of its arm is 20235500002" in said
+        assert "serial number" not in ok(capsys, command, paths[0], paths[2]).err
 
 
 def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):
