@@ -13,10 +13,12 @@ fit, whose statement counts as ν_0 degrees of freedom, so that a few lucky read
 
     ‖r‖² = rᵀ M r + ν_0,    ν = dof + ν_0
 
-The candidates with most evidence are fitted exactly. The best is a change if its p-value, times the
-number of candidates tested, is below `LEVEL`; then the next change is searched beside it. A change
-that is redundant beside the others is removed. The readings do not separate candidates with nearly
-the same evidence (odds below 20 : 1).
+A reading that is shifted by itself is scored as a candidate is, too. Where that has more evidence
+than all changes, and a p-value times the number of readings below `LEVEL`, it is a gross error and
+set aside. The candidates with most evidence are fitted exactly. The best is a change if its
+p-value, times the number of candidates tested, is below `LEVEL`; then the next change is searched
+beside it. A change that is redundant beside the others is removed. The readings do not separate
+candidates with nearly the same evidence (odds below 20 : 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -61,6 +63,9 @@ MOST_EXACT_FITS = 5
 MOST_REPAIRED_JOINTS = 2
 """Joints for which zero and compliance are tried together: those of the first candidates."""
 MOST_CHANGES = 4  # most changes that are searched: an arm with more is another arm; a choice
+GROSS_SCALE = 1e-3  # ordinary size of a gross error, m and rad; a choice
+MOST_SHIFTED = 20  # readings with the largest residual that are tested for a shift; for speed
+MOST_GROSS = 0.1  # largest share of readings that are set aside; a choice
 LEAST_INFORMATION_SHARE = 1e-4
 """Least share of a candidate's information that frames and prior must leave, a hundredth of its
 motion, for the readings to show it. A choice."""
@@ -166,6 +171,19 @@ class Limit:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class ShiftedReading:
+    """A later reading that is off by itself, and was set aside."""
+
+    pose: str
+    load: str
+    off_m: float  # by how much, m
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI."""
+        return {"pose": self.pose, "load": self.load, "off_m": self.off_m}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
     """The changes since an earlier campaign."""
@@ -173,6 +191,7 @@ class Changes:
     before: LaterFit  # the earlier fit at the later readings, without any change
     after: LaterFit  # with the changes
     found: tuple[Change, ...]  # strongest first
+    gross: tuple[ShiftedReading, ...]  # readings that were set aside
     limits: tuple[Limit, ...]  # of candidates with one parameter
     tested: int  # number of candidates that the readings can show, plus the number of joints
     hidden: tuple[Candidate, ...]  # that the readings cannot show: the frames absorb them
@@ -279,8 +298,9 @@ def find_changes(
         )
     catalogue = earlier.fit.model.catalogue
     possible = candidates(cell, later.readings.states, catalogue, w.m, anew=later.anew)
-    current, tested = before, 0
+    current, tested, most_gross = before, 0, int(MOST_GROSS * len(w))
     steps: list[_Step] = []
+    gross: list[ShiftedReading] = []
     hidden: tuple[Candidate, ...] = ()
     while len(steps) < MOST_CHANGES:
         say("testing what may have changed" if not steps else "testing what else may have changed")
@@ -289,6 +309,13 @@ def find_changes(
         if not steps:
             tested = len(shown) + cell.arm.n
             hidden = tuple(s.candidate for s in scored if not s.shown)
+        off = _off_by_itself(current, max((s.score.log_evidence for s in shown), default=0.0))
+        if off is not None and len(gross) < most_gross:
+            later = current.later.without(off[0])
+            gross.append(off[1])
+            before = fit_later(later)
+            current = fit_later(later, [s[0].effect_directions for s in steps])
+            continue
         best = _best(current, [s[0] for s in steps], shown, tested)
         if best is None:
             break
@@ -300,6 +327,7 @@ def find_changes(
         before=before,
         after=after,
         found=_sized(after, steps, earlier),
+        gross=tuple(gross),
         limits=_limits(after, possible, [s[0] for s in steps], tested),
         tested=tested,
         hidden=hidden,
@@ -328,6 +356,26 @@ def _score(minimum: LaterFit, candidate: Candidate) -> _ScoredChange:
     score = score_family(s, g, *_pooled(minimum))
     informative = float(np.trace(s)) > LEAST_INFORMATION_SHARE * float(np.sum(x**2))
     return _ScoredChange(candidate, score, s, motion, score.rank > 0 and informative)
+
+
+def _off_by_itself(minimum: LaterFit, least: float) -> tuple[int, ShiftedReading] | None:
+    """Return the row of a reading that is off by itself with more evidence than `least`, and it."""
+    later, w = minimum.later, minimum.later.w
+    residual = minimum.projection.project_out(minimum.target)
+    size = np.sum(residual.reshape(len(w), -1) ** 2, axis=1)
+    best, off = max(least, 0.0), None
+    for k in np.argsort(-size)[:MOST_SHIFTED].tolist():
+        raw = np.zeros((len(w), w.m, w.m))
+        raw[k] = GROSS_SCALE * np.eye(w.m)
+        x = later.scaled(w.whiten(raw))
+        s = minimum.projection.information(x)
+        score = score_family(s, x.T @ residual, *_pooled(minimum))
+        if score.p_value * len(w) < LEVEL and score.log_evidence > best:
+            r, row = later.readings, int(w.reading[k])
+            shift = GROSS_SCALE * float(np.linalg.norm(score.step[:3]))
+            pose, load = r.pose_names[r.pose[row]], r.load_names[r.load[row]]
+            best, off = score.log_evidence, (row, ShiftedReading(pose, load, shift))
+    return off
 
 
 def _best(

@@ -122,6 +122,7 @@ class Comparison(Shown):
             "changed": bool(c.found) or not c.explained,
             "another_arm": self.another_arm,
             "changes": [change.to_dict() for change in c.found],
+            "gross_errors": [g.to_dict() for g in c.gross],
             "explained": c.explained,
             "left_p_value": c.unexplained,
             "left_over_stated": c.scatter,

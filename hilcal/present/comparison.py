@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet, PooledType, UnlikeParameter
     from hilcal.transfer.members import TypeSize
 
+MOST_LISTED = 5  # gross errors
 MOST_PARAMETERS, MOST_ROWS = 6, 12  # listed parameters of a change; of both fits
 CLEAR = 2.0  # least σ of a listed parameter of a change that has several
 FAR = 3.0  # standard deviations between which most arms lie; a choice
@@ -48,6 +49,9 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
     if c.shared:
         model = "the baseline" if c.number is None else f"revision {c.number}"
         yield f"{c.shared} of its {c.readings} readings were fitted by {model}; they are left out."
+    if gross := c.changes.gross:
+        listed = [f"{g.pose}/{g.load} (off by {numbers.length(g.off_m)})" for g in gross]
+        yield f"Set aside as gross errors: {numbers.few(listed, MOST_LISTED)}; measure them again."
     if c.later_mode not in (None, c.mode):
         kinds = {"deflection": "deflections", "absolute": "absolute readings"}
         was, used = kinds[str(c.later_mode)], kinds[c.mode]

@@ -129,7 +129,7 @@ def compare(
         anew=anew,
         setup_stated=same_setup is not None,
         tool=_tool_differs(run, later),
-        today=error_today(comparison_setting, changes, nominal_rms),
+        today=error_today(changes.before.later, changes, nominal_rms),
         changes=changes,
         differences=None if record is None else _differences(fit, later, record, say),
     )

@@ -143,6 +143,12 @@ class LaterReadings:
     poses: Floats  # (R, L) rows of the misfit of each pose, in units of the noise √a
     anew: bool  # whether the tracker was set up anew
     frames: int  # number of parameters of frames that are estimated anew, the last ones
+    cell: Cell | None  # of the later campaign; None: that of the earlier fit
+
+    def without(self, row: int) -> "LaterReadings":
+        """Return the same without a reading."""
+        readings = self.readings[np.arange(len(self.readings)) != row]
+        return later_readings(self.earlier, readings, anew=self.anew, cell=self.cell)
 
     def scaled(self, white: Floats) -> Floats:
         """Whitened rows (R, ...) in units of the noise."""
@@ -303,7 +309,7 @@ def later_readings(
     lift = np.hstack([lift, np.eye(model.size)[:, count:] * size])
     poses = _pose_rows(earlier, w)
     return LaterReadings(
-        earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count
+        earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count, cell
     )
 
 

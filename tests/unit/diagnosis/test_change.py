@@ -27,7 +27,7 @@ def arm():
     return studied_arm(CONFIG, "ur10e", 0, poses=30)
 
 
-def later(arm, change, seed, *, anew=True, count=15):
+def later(arm, change, seed, *, anew=True, count=15, off=None):
     """Change the arm, measure it again, and compare."""
     rng = np.random.default_rng(seed)
     world = replace(arm.world, physics=change(arm.world.physics))
@@ -35,6 +35,8 @@ def later(arm, change, seed, *, anew=True, count=15):
         registration, station = place_tracker(arm.cell, rng)
         world = replace(world, registration=registration, station=station)
     readings = remeasured(world, arm.loads, count, rng)
+    if off is not None:
+        readings.value[off, :3] += [4e-3, 0.0, -3e-3]
     return find_changes(later_readings(arm.earlier, readings, anew=anew))
 
 
@@ -56,6 +58,16 @@ def test_without_a_change_nothing_is_claimed(arm, seed):
     assert found.before.rss == pytest.approx(
         found.before.dof, abs=4 * np.sqrt(2 * found.before.dof)
     )
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_gross_error_is_no_change_and_hides_none(arm, changed):
+    found = later(arm, zero(5, -1.5e-3) if changed else lambda p: p, 13, count=20, off=6)
+    (gross,) = found.gross
+    assert gross.pose == "p7"
+    assert gross.off_m == pytest.approx(5e-3, rel=0.1)
+    assert [c.candidate.name for c in found.found] == ["encoder_offset.j5"] * changed
+    assert found.explained
 
 
 def test_a_joints_new_zero_and_compliance_are_found_with_their_size(arm):
