@@ -391,19 +391,3 @@ def test_one_verdict_through_every_door(case, tmp_path, capsys):
             assert record.result_json["diagnose"]["verdict"] == row["verdict"]
     again = ok(capsys, "refine", path, "--from-latest", "--json").document
     assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("series", "limit_m"), [("Series_B", 0.110e-3), ("Series_C", 0.100e-3)])
-def test_refine_finds_what_the_arm_lacks(series, limit_m, ipa_ur10, tmp_path, capsys):
-    (measured,) = (ipa_ur10 / series).glob("measurements_*.csv")
-    run, cell = tmp_path / "ur10.hilcal", CELL.with_name("ipa_ur10.toml")
-    ok(capsys, "import", measured, "--format", "ipa-ur10", "--config", cell, "-o", run)
-    d = ok(capsys, "refine", run, "--json").document
-    first, last = d["revisions"][0], d["revisions"][-1]
-    assert first["model"] == ["base_frame", "target_offset"]  # frames only
-    assert first["error"]["holdout"]["mean_m"] > 0.8e-3
-    assert "transmission_error" in [r["added"] for r in d["revisions"]]
-    assert last["error"]["holdout"]["mean_m"] <= limit_m
-    words = ok(capsys, "compare", run).out
-    assert "noise alone" in words

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +52,10 @@ def test_transmission_error_is_found_and_the_error_falls(name, ipa_ur10):
     r = refined(name, ipa_ur10)
     assert r.steps[0].fit.model.names == ("base_frame", "target_offset")
     assert "transmission_error" in [s.added for s in r.steps]
-    held = [s.fit.holdout.rms_sigma for s in r.steps]
-    assert held == sorted(held, reverse=True)
-    assert r.steps[0].fit.holdout.mean_m > 0.5e-3
+    for before, after in pairwise(s.fit for s in r.steps):
+        if after.readings is before.readings:  # else σ is another: the arm's scatter enters it
+            assert after.holdout.rms_sigma <= before.holdout.rms_sigma
+    assert r.steps[0].fit.holdout.mean_m > 0.8e-3
     assert r.steps[-1].fit.holdout.mean_m <= LIMIT_M[name]
     assert r.steps[-1].fit.outlier.mean() < 0.02
     # Held out is held out: not better than fitted.
