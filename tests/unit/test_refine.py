@@ -1,11 +1,13 @@
 """Refinement: effect by effect, until the held-out error lies on the noise floor."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from hilcal import refinement
+from hilcal.diagnosis.background_evidence import background_is_better
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.stepwise import add
 from hilcal.drivers.simulated.injected_effects import hide_effect
@@ -19,7 +21,7 @@ from hilcal.model.model import Model
 from hilcal.numbers import percent
 from hilcal.present.story import prior_report
 from hilcal.present.verdict import message
-from hilcal.refinement import MOST_REVISIONS, PRIOR, Path, refine, refine_from
+from hilcal.refinement import BACKGROUND, MOST_REVISIONS, PRIOR, Path, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline
@@ -30,16 +32,22 @@ from tests.support.rows import first
 
 
 def check_steps(r):
-    """What holds of every refinement."""
+    """What holds of every refinement; with a background, of the steps before it."""
     assert 1 <= len(r.steps) <= MOST_REVISIONS
     assert r.steps[0].added is None
-    for before, after in zip(r.steps, r.steps[1:], strict=False):
+    alone = [s for s in r.steps if not s.fit.model.background]
+    for before, after in pairwise(alone):
         assert after.fit.model.names == (*before.fit.model.names, after.added)
         assert after.added in before.diagnosis.significant
         held = [s.fit.holdout.rms_sigma for s in (before, after)]
         assert held[1] < (1 - LEAST_GAIN) * held[0]
         assert after.fit.readings is before.fit.readings
-    assert set(r.rejected).isdisjoint(r.steps[-1].fit.model.names)
+    with_all = r.steps[len(alone) :]
+    if with_all:
+        assert with_all[0].added == BACKGROUND
+        assert all(s.fit.model.background for s in with_all)
+        assert background_is_better(alone[-1].fit, with_all[0].fit)
+    assert set(r.rejected).isdisjoint(r.steps[-1].fit.model.named)
 
 
 @pytest.mark.parametrize(
