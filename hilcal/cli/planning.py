@@ -113,8 +113,9 @@ def plan(
             robot_cell, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
+        compare = (details or t.json) and not quick  # no other output shows the comparison
         summary = summarise(
-            chosen, robot_cell.configured(), rng, say, compare=not quick, curve=not quick
+            chosen, robot_cell.configured(), rng, say, compare=compare, curve=not quick
         )
         say("checking every motion in a dry run")
         checked_plan = checked(robot_cell, plan_, summary)

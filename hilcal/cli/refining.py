@@ -97,7 +97,7 @@ def _show_next_command(
         line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
     elif d.reason in ("background", "unconfirmed_suspect"):
         what = "To plan further poses:"
-        line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run), "--quick"]
+        line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run)]
     else:
         return
     line += [] if revision is None else ["--revision", str(revision)]

@@ -192,7 +192,7 @@ def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_
 
     monkeypatch.setattr("hilcal.cli.refining.judge", judged)
     said = ok(capsys, "diagnose", fitted).out
-    step = f"hilcal plan CELL.toml -o PLAN.json --after '{fitted}' --quick"
+    step = f"hilcal plan CELL.toml -o PLAN.json --after '{fitted}'"
     follow(capsys, said, step, **{"CELL.toml": CELL, "PLAN.json": tmp_path / "plan.json"})
 
 

@@ -173,6 +173,12 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
     assert "More would give, predicted for the deflection: 30 poses ±" in words
 
 
+def test_criteria_are_compared_only_where_they_are_shown(tmp_path, capsys):
+    words = ("plan", cell_file(tmp_path, small()), "-o", tmp_path / "p.json", "--poses", "3")
+    assert "comparing numbers of poses" in ok(capsys, *words).err
+    assert "comparing criteria and numbers of poses" in ok(capsys, *words, "--details").err
+
+
 @pytest.mark.long
 def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(tmp_path, capsys):
     """What is appended is measured from there: its ways are checked from there."""
