@@ -39,6 +39,7 @@ from hilcal.procedure.next_plan import Doubt, doubt_to_settle, fit_without, next
 from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import FORMAT, Plan, load_plan
+from hilcal.store.run_log import PLAN
 from hilcal.tables.write import ORDER, plan_csv
 from hilcal.whole_file import replace_file
 
@@ -100,10 +101,11 @@ def plan(
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
     request = PlanRequest(poses, readings, criterion, unloaded=unloaded)
     with working(t.progress) as say:
-        fitted, reference = None, None
+        fitted, reference, appendable = None, None, False
         if after is not None:
             with Campaign.open(after, catalogue, read_only=True) as run:
                 fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
+                appendable = run.file.about(PLAN) is not None
             config = robot_cell.configured()
             if "readings" not in config.planning.model_fields_set:
                 config = config.with_keys("planning", readings=fitted.mode)
@@ -122,6 +124,8 @@ def plan(
     write(t, robot_cell, checked_plan, output, csv, record)
     t.show(plan_report(checked_plan.summary) if details else plan_screen(checked_plan.summary))
     t.show(f"The plan is in {output}; you may edit the file. Every limit was checked.")
+    if after is not None:
+        _show_adding(t, after, output, cell, appendable)
     t.document({**checked_plan.to_dict(), "plan": str(output)})
 
 
@@ -272,13 +276,19 @@ def next_(
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
-    how, *commands = adding_lines(run, output, cell, planned.appendable)
-    t.show(f"The plan is in {output}. {how}")
-    for line in commands:
-        t.show(f"  {line}")
+    t.show(f"The plan is in {output}.")
+    _show_adding(t, run, output, cell, planned.appendable)
     t.document(
         checked_plan.to_dict(), plan=str(output), suspects=list(effects), **separates(chosen)
     )
+
+
+def _show_adding(t: Terminal, run: Path, plan: Path, cell: Path | None, appendable: bool) -> None:
+    """Print the commands that add the readings of a further plan to a campaign."""
+    how, *commands = adding_lines(run, plan, cell, appendable)
+    t.show(how)
+    for line in commands:
+        t.command(line)
 
 
 def separates(chosen: SeparatingPlan) -> dict[str, object]:

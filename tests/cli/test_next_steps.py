@@ -193,7 +193,11 @@ def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_
     monkeypatch.setattr("hilcal.cli.refining.judge", judged)
     said = ok(capsys, "diagnose", fitted).out
     step = f"hilcal plan CELL.toml -o PLAN.json --after '{fitted}'"
-    follow(capsys, said, step, **{"CELL.toml": CELL, "PLAN.json": tmp_path / "plan.json"})
+    places = {"CELL.toml": CELL, "PLAN.json": tmp_path / "plan.json"}
+    said = follow(capsys, said, step, **places).out
+    places = {"READINGS.csv": tmp_path / "t.csv"}
+    follow(capsys, said, f"hilcal export '{fitted}' --readings READINGS.csv", **places)
+    assert f"hilcal import READINGS.csv --config {CELL} -o NEW.hilcal" in " ".join(said.split())
 
 
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
