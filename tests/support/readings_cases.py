@@ -54,6 +54,8 @@ def readings(draw, n=6):
     used = [load_names[k] for k in dict.fromkeys(load_raw)]
     loaded = np.array(load_raw, dtype=float)[:, None]
     q = draw(floats((count, n), 6.0))[pose]
+    value = draw(floats((count, m), 1.5))
+    value[:, 0] = draw(st.permutations(range(count)))  # m: joints that move move the target
     root = draw(floats((count, m, m), 1.0))
     cov = 1e-8 * (root @ np.swapaxes(root, 1, 2) + np.eye(m))
     cov = np.triu(cov) + np.swapaxes(np.triu(cov, 1), 1, 2)
@@ -75,7 +77,7 @@ def readings(draw, n=6):
         pose=pose,
         load=load,
         cycle=np.array(draw(st.lists(st.integers(-9, 2**53), min_size=count, max_size=count))),
-        value=draw(floats((count, m), 1.5)),
+        value=value,
         covariance=cov,
         load_names=tuple(used),
         pose_names=tuple(pose_names[: pose.max() + 1]),
