@@ -87,7 +87,7 @@ def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None 
 def _show_next_command(
     t: Terminal, catalogue: Catalogue, run: Path, revision: int | None, d: Diagnosis
 ) -> None:
-    """Print the command that adds what is missing, or plans what tells more."""
+    """Print the command that adds what is missing, searches for it, or plans what tells more."""
     doubt = in_doubt(d)
     if d.verdict == "missing_effect" and d.lead is not None:
         doubt, what = (d.lead.effect,), "To add it, and see the error before and after:"
@@ -98,6 +98,11 @@ def _show_next_command(
     elif d.reason in ("background", "unconfirmed_suspect"):
         what = "To plan further poses:"
         line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run)]
+    elif d.reason in ("no_suspect", "insufficient_catalogue") and d.step is None:
+        what = "To search for the law of what is missing:"
+        names = itertools.chain(["law"], (f"law_{k}" for k in itertools.count(2)))
+        new = next(name for name in names if name not in catalogue.names)
+        line = ["hilcal", "discover", quoted(run), "-o", f"{new}.py"]
     else:
         return
     line += [] if revision is None else ["--revision", str(revision)]
@@ -267,6 +272,10 @@ def refine(
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
             t.show(dependence_sentence(diagnosis.misfit_breakdown))
         t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
+        if diagnosis.verdict == "unknown_effect" and laws is None:
+            in_use = o.in_use()
+            same = in_use is not None and in_use.number == numbered[-1]
+            _show_next_command(t, catalogue, run, None if same else numbered[-1], diagnosis)
         if live is not None:  # verdicts may have changed when further effects were tried
             for chapter in chapters:
                 live.revised(chapter)

@@ -110,9 +110,8 @@ def _unexplained(d: Diagnosis) -> Iterator[Block]:
         yield from curves(d.dependences)
     if d.verdict == "unknown_effect":
         yield note(
-            "To search for its law: hilcal discover RUN -o law.py. To try an effect of your own: "
-            "hilcal effects new NAME writes an example, --effects-from FILE.py adds it to the "
-            "catalogue."
+            "hilcal discover searches for its law. To try an effect of your own: hilcal effects "
+            "new NAME writes an example, --effects-from FILE.py adds it to the catalogue."
         )
 
 

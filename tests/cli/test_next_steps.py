@@ -17,6 +17,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.procedure.next_plan import doubt_to_settle
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.parquet_stream import open_stream
@@ -198,6 +199,23 @@ def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_
     places = {"READINGS.csv": tmp_path / "t.csv"}
     follow(capsys, said, f"hilcal export '{fitted}' --readings READINGS.csv", **places)
     assert f"hilcal import READINGS.csv --config {CELL} -o NEW.hilcal" in " ".join(said.split())
+
+
+@pytest.mark.parametrize("name", ["diagnose", "refine"])
+def test_what_is_said_where_the_catalogue_lacks_the_effect(run, capsys, monkeypatch, name):
+    def unexplained(d):
+        return replace(d, reason="no_suspect", suspects=())
+
+    def refined(*args):
+        found = refine(*args)
+        last = found.steps[-1]
+        last = replace(last, diagnosis=unexplained(last.diagnosis))
+        return replace(found, steps=(*found.steps[:-1], last))
+
+    monkeypatch.setattr("hilcal.cli.refining.judge", lambda *a: unexplained(diagnose(*a)))
+    monkeypatch.setattr("hilcal.cli.refining.refine_model", refined)
+    said = ok(capsys, name, run).out
+    assert said.splitlines()[-1].strip() == f"hilcal discover '{run}' -o law.py"
 
 
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
