@@ -63,10 +63,11 @@ def check_same_devices(campaign: CampaignFile, rehearse: bool) -> None:
         raise InputError(f"{campaign.path}: the campaign is {kind}")
 
 
-def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> None:
+def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> bool:
     """Refuse to continue a campaign, or to test its model, on another arm of the same model.
 
-    Arms and controllers that report no serial number are not compared.
+    Return whether that is sure: arms and controllers that report no serial number cannot be
+    compared. The first session of a campaign that tests no model has nothing to compare with.
 
     Args:
         log: of the campaign.
@@ -78,6 +79,7 @@ def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> None:
             f"arm: its serial number is {now}, and the campaign was begun on the arm {before}; a "
             "campaign is of one arm: start another one for this"
         )
+    return bool(before and now) or not log.continues()
 
 
 def _serial_number(answers: Sequence[Mapping[str, Any]]) -> str:
@@ -267,6 +269,10 @@ class RunLog:
         stated = self._campaign.about(SERIAL_NUMBER)
         told = (_serial_number(e["answers"]) for e in self.events() if e["kind"] == "devices")
         return stated or next(filter(None, told), "")
+
+    def continues(self) -> bool:
+        """Whether the campaign has had a session, or tests a model of another campaign."""
+        return self._campaign.about(SERIAL_NUMBER) is not None or self.last("devices") is not None
 
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""
