@@ -122,7 +122,7 @@ def run(
                 further = log.with_new_names(given)
                 if moved := _reference_moved(given, further):
                     t.notice(f"note: {plan}: {moved}")
-                refuse(dry_checked(t, robot_cell, further), str(plan))
+                _check_given(t, robot_cell, further, plan)
                 if missing := len(log.plan.without(log.done()).steps):
                     t.notice(
                         f"note: {missing} readings of the previous plan are missing; they will not "
@@ -134,10 +134,12 @@ def run(
                     f"{output}: the file exists; --resume continues it, --append adds a plan; or "
                     "choose another name"
                 )
-            campaign_plan = (
-                load_plan(plan) if plan else _default_plan(t, cell, robot_cell, catalogue, yes)
-            )
-            refuse(dry_checked(t, robot_cell, campaign_plan), str(plan or "the plan"))
+            if plan is None:
+                campaign_plan = _default_plan(t, cell, robot_cell, catalogue, yes)
+                refuse(dry_checked(t, robot_cell, campaign_plan), "the plan")
+            else:
+                campaign_plan = load_plan(plan)
+                _check_given(t, robot_cell, campaign_plan, plan)
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
@@ -190,6 +192,14 @@ def _reference_moved(given: Plan, renamed: Plan) -> str:
         f'its pose "{REFERENCE}" is up to {far:.3g} rad from that of the campaign, to which the '
         "arm goes in its place: the drift is measured there"
     )
+
+
+def _check_given(t: Terminal, cell: Cell, plan: Plan, path: Path) -> None:
+    """Check a given plan in a dry run, and print its remarks; refuse a plan with problems."""
+    dry = dry_checked(t, cell, plan)
+    refuse(dry, str(path))
+    for remark in dry.remarks:
+        t.notice(f"note: {path}: {remark}")
 
 
 def _default_plan(t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, yes: bool) -> Plan:

@@ -11,7 +11,17 @@ from hilcal.config import CellConfig
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import ARM, BY_HOME, LEFT_OUT, REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import (
+    ARM,
+    BY_HOME,
+    KEYS,
+    LEFT_OUT,
+    REFERENCE,
+    UNLOADED,
+    Plan,
+    Step,
+    unknown_keys,
+)
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
@@ -203,6 +213,11 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
             f"{len(unpaired)} loaded readings have no unloaded one of the same pose and cycle, "
             f'which a deflection needs; the first: "{first}"'
         )
+    out += [
+        f'"{key}" is no key of a plan{suggest(key, KEYS)}, and is ignored; valid: '
+        f"{', '.join(KEYS)}, and names that begin with x_"
+        for key in unknown_keys(plan)
+    ]
     if REFERENCE not in plan.pose_names:
         out.append(
             f'no pose has the name "{REFERENCE}": loads are changed at {plan.home}, and drift '

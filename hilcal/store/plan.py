@@ -180,6 +180,17 @@ _USED_KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     ),
 }
 """Keys of `Plan.about` that a run reads: what is valid, and whether a value is."""
+KEYS = (
+    *_USED_KEYS, ARM, "order", "made_by", "criterion", "efficiency", "predicted_std",
+    "position_std_m", "position", "position_note", "candidates", "suspects", "separates",
+    "remarks", "purpose", "points",
+)  # fmt: skip
+"""All keys of `Plan.about`: also how a plan was made, what it predicts, and what it is for."""
+
+
+def unknown_keys(plan: Plan) -> tuple[str, ...]:
+    """Return keys of `Plan.about` that are not in `KEYS`; names that begin with x_ are free."""
+    return tuple(key for key in plan.about if key not in KEYS and not key.startswith("x_"))
 
 
 def _entries(data: object, kind: str, where: str) -> list[Any]:

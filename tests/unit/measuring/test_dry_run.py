@@ -151,6 +151,12 @@ def test_what_force_sensor_and_arm_bear():
     assert any("the tool is 13 kg" in p for p in problems(bench, plan_of(("p1", "none", 0))))
 
 
+def test_unknown_keys_of_a_plan_are_remarks():
+    plan = replace(usual_plan(), about={"duration": {"total": 9.0}, "x_why": "mine", "points": []})
+    (remark,) = dry_run(Bench().cell, plan).remarks
+    assert remark.startswith('"duration" is no key of a plan (did you mean "duration_s"?), and is ')
+
+
 def test_lacking_unloaded_readings_and_reference_are_remarks():
     bench = Bench()
     poses = {name: q for name, q in POSES.items() if name != "reference"}
