@@ -31,11 +31,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 import scipy
@@ -51,6 +51,7 @@ if TYPE_CHECKING:  # takes half a second to import
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Parameters = ParamSpec("Parameters")
 Advance = Callable[[int], None]
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
 """Shows the progress of a number of items under a label, as `present.progress.counting` does."""
@@ -94,6 +95,21 @@ def one_blas_thread() -> None:
     The last bits of a sum depend on the number of threads.
     """
     threadpool_limits(limits=1, user_api="blas")
+
+
+def with_one_blas_thread(work: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Return the function with BLAS limited to one thread while it runs.
+
+    Several gain nothing on small matrices, and where other programs compute, too, they wait for
+    each other at every product.
+    """
+
+    @wraps(work)
+    def limited(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return work(*args, **kwargs)
+
+    return limited
 
 
 @dataclass(frozen=True, slots=True)

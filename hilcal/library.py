@@ -18,7 +18,7 @@ from hilcal.diagnosis.verdict import diagnose as judge_fit
 from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.engine import open_engine
+from hilcal.engine import open_engine, with_one_blas_thread
 from hilcal.errors import InputError, expect
 from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps
@@ -235,6 +235,7 @@ def bootstrap(
         return bootstraps.bootstrap(found, engine, draws, seed)
 
 
+@with_one_blas_thread
 def baseline(
     cell: Cell | Campaign,
     data: Readings | Campaign | None = None,
@@ -296,6 +297,7 @@ def _carried(
     return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 
+@with_one_blas_thread
 def fit(
     model: Model,
     data: Readings | Campaign | None = None,
@@ -353,6 +355,7 @@ def fit(
     return with_serial_noise(fitted, std)
 
 
+@with_one_blas_thread
 def diagnose(
     fit: Fit | Campaign,
     history: History = NO_HISTORY,
@@ -413,6 +416,7 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
         return run.posterior()
 
 
+@with_one_blas_thread
 def refine(
     model: Model | Campaign,
     data: Readings | Campaign | None = None,
@@ -469,6 +473,7 @@ def refine(
     return refinement
 
 
+@with_one_blas_thread
 def plan(
     cell: Cell,
     poses: int = 20,

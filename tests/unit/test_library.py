@@ -14,8 +14,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import hilcal as hc
+from hilcal import library
 from hilcal.config import load_config
 from hilcal.config.reference import to_toml
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
@@ -58,6 +60,24 @@ def site(tmp_path_factory):
     cell = folder / "CELL.toml"
     cell.write_text(to_toml(quickly_planned(config)), encoding="utf-8")
     return SimpleNamespace(table=table, run=run, later=later, cell=cell, folder=folder)
+
+
+def test_functions_use_one_thread_of_blas_and_leave_the_callers_limit(site, monkeypatch):
+    """Two threads of one fit wait for each other wherever another program computes."""
+
+    def threads():
+        return {i["num_threads"] for i in threadpool_info() if i["user_api"] == "blas"}
+
+    def fitted(*args, **options):
+        seen.append(threads())
+        return fit(*args, **options)
+
+    seen, fit = [], library.fits.fit
+    monkeypatch.setattr(library.fits, "fit", fitted)
+    with hc.Campaign.open(site.run) as run, threadpool_limits(limits=2, user_api="blas"):
+        hc.fit(hc.baseline(run), run)
+        assert threads() == {2}
+    assert seen == [{1}]
 
 
 @pytest.fixture(scope="module")
