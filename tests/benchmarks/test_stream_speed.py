@@ -28,6 +28,8 @@ READINGS = 200_000
 PARAMETERS = 30
 CHUNK = 8192
 ROUNDS = 3
+LEAST = 0.6  # rate over that with AᵀA
+LIMIT = f"{LEAST} or more"
 
 
 class Product:
@@ -97,9 +99,9 @@ def test_a_stream_against_reading_and_multiplying(benchmark, claim, tmp_path, mo
     best = {name: min(found) for name, found in times.items()}
     given = best["multiply"] / best["reduce"]
     size = f"{READINGS} 3-D readings x {PARAMETERS} parameters"
-    claim(f"stream, rows given, {size}: rate over reading and AᵀA", f"{given:.2f}", "0.6 or more")
+    claim(f"stream, rows given, {size}: rate over reading and AᵀA", f"{given:.2f}", LIMIT)
     same = best["whole multiply"] / best["whole"]
-    claim(f"stream, a whole pass, {size}: rate over the same with AᵀA", f"{same:.2f}", "0.6")
+    claim(f"stream, a whole pass, {size}: rate over the same with AᵀA", f"{same:.2f}", LIMIT)
     alone = best["multiply"] / best["whole"]
     claim(f"stream, a whole pass, {size}: over reading given rows and AᵀA", f"{alone:.3f}", "noted")
     claim("stream, a whole pass: readings a second", f"{READINGS / best['whole']:.0f}", "noted")
@@ -107,3 +109,4 @@ def test_a_stream_against_reading_and_multiplying(benchmark, claim, tmp_path, mo
     claim("resident memory of the benchmarks so far, GB", f"{peak:.2f}", "1 of a stream alone")
     benchmark.extra_info.update(best)
     benchmark.pedantic(given_rows, args=(rows, Triangle), rounds=1)
+    assert min(given, same) >= LEAST
