@@ -63,7 +63,8 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
         "hilcal import READINGS.csv --config CELL.toml",
     ):
         assert part in " ".join(words.split())
-    assert max(map(len, words.splitlines())) <= 100
+    wrapped = [line for line in words.splitlines() if not line.startswith("  hilcal ")]
+    assert max(map(len, wrapped)) <= 100  # commands are not, to be copied
 
 
 @pytest.mark.slow
