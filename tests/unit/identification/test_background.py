@@ -42,6 +42,7 @@ from studies.all_effects_command import refined as all_effects
 from studies.diagnosis import DiagnosisCase
 from studies.diagnosis_command import simulate
 from studies.random_campaigns import rehearsal_states
+from studies.random_descriptions import readings_of
 from studies.study_cases import study_case, with_study_loads
 from tests.support.campaigns import configuration
 from tests.support.fit_cases import fitted_model, refined
@@ -503,3 +504,33 @@ def test_beside_a_background_chance_explains_nothing(found):
         p_values += [s.p_value for s in shares if s.group not in ("pose", "direction")]
     assert min(p_values) > 0.001
     assert 0.35 < np.mean(p_values) < 0.65
+
+
+@pytest.mark.long
+def test_a_fit_that_spends_most_readings_is_never_adequate():
+    """20 positions of an arm with errors of links, zeros and gears, which few waves imitate."""
+    rng = np.random.default_rng(12)
+    tool = {"target_m": [0.05, 0.02, 0.1], "mass_kg": 1.0, "com_m": [0.0, 0.0, 0.04]}
+    cell = Cell.load({"robot": {"model": "ur10e"}, "tool": tool})
+    q = rng.uniform(-2.5, 2.5, (120, cell.arm.n))
+    plain = readings_of(q, evaluate(cell.arm, q).point(cell.target[:3, 3]), np.full(3, 1e-5))
+    true = baseline(cell, plain, "absolute")
+    for name, options in (
+        ("link_geometry", {}),
+        ("encoder_offset", {}),
+        ("transmission_error", {"harmonics": 2}),
+    ):
+        true = true + EffectSpec(name, options)
+    times = {"link_geometry": 1.0, "encoder_offset": 6.0, "transmission_error": 3.0}
+    theta = [
+        times.get(e.name, 0.0) * e.magnitudes * rng.standard_normal(len(e.magnitudes))
+        for e in true.effects
+    ]
+    value = true.predict(plain.states, np.concatenate(theta)).observation.position
+    r = readings_of(q, value + 1e-5 * rng.standard_normal(value.shape), np.full(3, 1e-5))
+    last = refine(baseline(cell, r[:20], "absolute"), r[:20], "absolute")
+    before = last.steps[[step.added for step in last.steps].index(BACKGROUND) - 1].fit
+    assert before.dof < before.whitening.rank / 2
+    assert last.verdict == "ambiguous"
+    assert last.fit.model.background
+    assert error(last.fit, r[20:]) < error(before, r[20:])
