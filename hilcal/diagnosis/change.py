@@ -15,10 +15,12 @@ fit, whose statement counts as ν_0 degrees of freedom, so that a few lucky read
 
 A reading that is shifted by itself is scored as a candidate is, too. Where that has more evidence
 than all changes, and a p-value times the number of readings below `LEVEL`, it is a gross error and
-set aside. The candidates with most evidence are fitted exactly. The best is a change if its
-p-value, times the number of candidates tested, is below `LEVEL`; then the next change is searched
-beside it. A change that is redundant beside the others is removed. The readings do not separate
-candidates with nearly the same evidence (odds below 20 : 1).
+set aside. A candidate has the directions that the readings determine better than to their plausible
+size (`Effect.most`): others would run off, and absorb scatter. The candidates with most evidence
+are fitted exactly. The best is a change if its p-value, times the number of candidates tested, is
+below `LEVEL`; then the next change is searched beside it. A change that is redundant beside the
+others is removed. The readings do not separate candidates with nearly the same evidence (odds below
+20 : 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -83,7 +85,8 @@ class Candidate:
     parameters: tuple[str, ...]  # (k,) names of the directions
     units: tuple[str, ...]
     scale: Floats  # (k,) their ordinary magnitudes, SI
-    effect_directions: EffectDirections  # the directions, in ordinary magnitudes
+    effect_directions: EffectDirections  # D V, the directions that are fitted
+    basis: Floats  # (k, d) orthonormal V, of the directions D in ordinary magnitudes
 
     @property
     def kind(self) -> Kind:
@@ -94,6 +97,25 @@ class Candidate:
     def of_arm(self) -> bool:
         """Whether it is a change of the arm itself."""
         return self.kind in ("joint", "link", "base")
+
+    @property
+    def count(self) -> int:
+        """Number of directions that are fitted."""
+        return int(self.basis.shape[1])
+
+    @property
+    def most(self) -> float:
+        """Largest plausible standard deviation of a parameter, in ordinary magnitudes."""
+        return self.effect_directions.effect.most()
+
+    def determined(self, information: Floats) -> "Candidate":
+        """Return it with the directions alone that readings with S (k, k) determine."""
+        values, vectors = np.linalg.eigh((information + information.T) / 2)
+        basis = vectors[:, visible(values) & (values >= self.most**-2)]
+        full = self.effect_directions
+        return replace(
+            self, effect_directions=replace(full, directions=full.directions @ basis), basis=basis
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,9 +152,14 @@ class Change:
     same_as: tuple[Candidate, ...]  # candidates that these readings do not separate from it
 
     @property
+    def possible(self) -> tuple[Candidate, ...]:
+        """What may have changed, the likeliest first."""
+        return self.candidate, *self.same_as
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """The parts of the cell that may have changed, the likeliest first."""
-        return tuple(dict.fromkeys(c.part for c in (self.candidate, *self.same_as)))
+        return tuple(dict.fromkeys(c.part for c in self.possible))
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
@@ -230,7 +257,8 @@ def candidates(
 
     def put(name: str, effect: Effect, change: Changeable, d: Directions, joint: int = 0) -> None:
         units, moving = (d.parameters, d.units, d.scale), EffectDirections(effect, d.matrix)
-        out.append(Candidate(d.name, name, change.part, joint, change, *units, moving))
+        basis = np.eye(len(d.parameters))
+        out.append(Candidate(d.name, name, change.part, joint, change, *units, moving, basis))
 
     for name in changing(catalogue):
         change = catalogue[name].change
@@ -267,9 +295,9 @@ def _single(name: str, effect: Effect, label: str = "") -> Directions:
 class _ScoredChange:
     """A candidate beside the changes found so far."""
 
-    candidate: Candidate
+    candidate: Candidate  # with the d directions that the readings determine beside them
     score: FamilyScore
-    information: Floats  # (k, k)
+    information: Floats  # (d, d)
     motion: Floats  # (D, 3, k)
     shown: bool  # whether the readings can show it
 
@@ -304,7 +332,7 @@ def find_changes(
     hidden: tuple[Candidate, ...] = ()
     while len(steps) < MOST_CHANGES:
         say("testing what may have changed" if not steps else "testing what else may have changed")
-        scored = [_score(current, c) for c in possible if all(c is not s[0] for s in steps)]
+        scored = [_score(current, c) for c in possible if all(c.name != s[0].name for s in steps)]
         shown = [s for s in scored if s.shown]
         if not steps:
             tested = len(shown) + cell.arm.n
@@ -352,9 +380,11 @@ def _least_noise(minimum: LaterFit) -> float:
 def _score(minimum: LaterFit, candidate: Candidate) -> _ScoredChange:
     x, motion = minimum.columns(candidate.effect_directions)
     s = minimum.projection.information(x)
+    candidate, size = candidate.determined(s), float(np.sum(x**2))
+    x, s = x @ candidate.basis, candidate.basis.T @ s @ candidate.basis
     g = x.T @ minimum.projection.project_out(minimum.target)
     score = score_family(s, g, *_pooled(minimum))
-    informative = float(np.trace(s)) > LEAST_INFORMATION_SHARE * float(np.sum(x**2))
+    informative = float(np.trace(s)) > LEAST_INFORMATION_SHARE * size
     return _ScoredChange(candidate, score, s, motion, score.rank > 0 and informative)
 
 
@@ -392,7 +422,7 @@ def _best(
             after = fit_later(minimum.later, moving, minimum)
         except CannotAnswerError:
             continue
-        evidence, p_value = _exact(minimum, after, sum(len(c.parameters) for c in added))
+        evidence, p_value = _exact(minimum, after, sum(c.count for c in added))
         tried.append((evidence, p_value, after, added))
     tried.sort(key=lambda t: -t[0])
     sure = [t for t in tried if t[1] * tested < LEVEL and t[0] > 0.0]
@@ -401,8 +431,8 @@ def _best(
     most = sure[0][0]
 
     def size(t: _Trial) -> tuple[int, float]:
-        """Number of parameters, and their rms in units of plausible sizes."""
-        plausible = [c.effect_directions.effect.most() for c in t[3] for _ in c.parameters]
+        """Number of directions, and the rms of their sizes in units of plausible ones."""
+        plausible = [c.most for c in t[3] for _ in range(c.count)]
         relative = t[2].sizes[-len(plausible) :] / plausible
         return len(plausible), float(np.sqrt(np.mean(relative**2)))
 
@@ -455,7 +485,7 @@ def _needed(minimum: LaterFit, steps: list[_Step], tested: int) -> tuple[LaterFi
         without = []
         for k, step in enumerate(steps):
             moving = [s[0].effect_directions for s in steps if s is not step]
-            reduced, count = fit_later(minimum.later, moving), len(step[0].parameters)
+            reduced, count = fit_later(minimum.later, moving), step[0].count
             gain = max(reduced.rss - minimum.rss, 0.0)
             p_value = float(scipy.stats.f.sf(gain / count * dof / rss, count, dof))
             without.append((p_value, k, reduced))
@@ -475,10 +505,13 @@ def _sized(after: LaterFit, steps: Sequence[_Step], earlier: EarlierFit) -> tupl
     }
     out, start = [], 0
     for c, p_value, evidence, same in steps:
-        index = slice(start, start + len(c.parameters))
+        index = slice(start, start + c.count)
         start = index.stop
-        value = c.scale * after.sizes[index]
-        std = c.scale * np.sqrt(noise * np.diag(after.inverse)[index])
+        value = c.scale * (c.basis @ after.sizes[index])
+        variance = noise * np.diag(c.basis @ after.inverse[index, index] @ c.basis.T)
+        if c.count < len(c.parameters):  # what is not determined is known to its plausible size
+            variance += c.most**2 * np.maximum(1.0 - np.sum(c.basis**2, axis=1), 0.0)
+        std = c.scale * np.sqrt(variance)
         moved = after.columns(c.effect_directions)[1] @ after.sizes[index]
         rows = zip(c.parameters, c.units, value.tolist(), std.tolist(), strict=True)
         sizes = tuple(ChangeSize(p, u, v, e, before.get((c.effect, p))) for p, u, v, e in rows)
@@ -494,14 +527,14 @@ def _limits(
     noise, dof = _least_noise(after), _pooled(after)[1]
     out = []
     for c in possible:
-        if len(c.parameters) != 1 or any(c is f for f in changed):
+        if len(c.parameters) != 1 or any(c.name == f.name for f in changed):
             continue
         s = _score(after, c)
         size = np.inf
         if s.shown:
             noncentrality = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
             size = float(np.sqrt(noncentrality * noise / s.information[0, 0]))
-            size = size if size <= c.effect_directions.effect.most() else np.inf
+            size = size if size <= c.most else np.inf
         moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
         moved_m = size * moved if np.isfinite(size) else np.inf
         size *= float(c.scale[0])

@@ -1,6 +1,6 @@
 """Reports of `compare A B` (changes of an arm) and `fleet` (arms that differ from their type)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from hilcal import numbers
@@ -99,9 +99,15 @@ def headline(c: Comparison) -> str:
         return "Nothing has changed beyond the uncertainty"
     if c.another_arm:
         return "This looks like another arm of the same type"
-    if parts := numbers.names(list(dict.fromkeys(x.candidate.part for x in changes.found))):
+    if parts := _parts(x.parts for x in changes.found):
         return f"Something has changed: {parts}"
     return "Something has changed, and no single candidate explains it"
+
+
+def _parts(changes: Iterable[Sequence[str]]) -> str:
+    """Return the parts of changes; "or" is between those of one change."""
+    one = (numbers.names(list(dict.fromkeys(parts)), "or") for parts in changes)
+    return numbers.names(list(dict.fromkeys(one)))
 
 
 def _changes(c: Comparison) -> Iterator[Block]:
@@ -125,8 +131,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
             alternatives = numbers.names([part_name(o) for o in change.same_as], "or")
             yield f"  These readings do not distinguish it from {alternatives}."
     yield from ("", _table(changes.found))
-    candidates = (x.candidate for x in changes.found)
-    if setup := dict.fromkeys(part_name(x) for x in candidates if not x.of_arm):
+    sound = [x.candidate for x in changes.found if not any(o.of_arm for o in x.possible)]
+    if setup := dict.fromkeys(map(part_name, sound)):
         yield f"Not of the arm: {numbers.names(list(setup))}."
     yield _remainder(c)
     tests = numbers.many_tests(changes.tested, LEVEL, "candidates")
@@ -241,18 +247,27 @@ def next_step(c: Comparison, earlier: str) -> str:
         return "calibrate it separately."
     if not changes.found and changes.explained:
         return f"nothing; the calibration of {earlier} holds."
-    arm = [x for x in changes.found if x.candidate.of_arm]
+    arm = [x for x in changes.found if any(o.of_arm for o in x.possible)]
     if changes.explained and changes.found and not arm:
         return f"correct the setup, and compare again; the calibration of {earlier} holds."
-    parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm))) or "the arm"
-    return f"recalibrate {parts}, with {earlier} as prior; more readings reduce the uncertainty."
+    doubtful = [x for x in arm if not all(o.of_arm for o in x.possible)]
+    parts = _parts(x.parts for x in arm if x not in doubtful)
+    parts = parts or "the arm" * (not doubtful)
+    setup = list(dict.fromkeys(part_name(o) for x in doubtful for o in x.possible if not o.of_arm))
+    links = _parts([o.part for o in x.possible if o.of_arm] for x in doubtful)
+    if doubtful and parts:
+        parts = f"{parts}, and, only if {numbers.names(setup)} is as it was, {links}"
+    check = f"check {numbers.names(setup)}; only if that is as it was, " if not parts else ""
+    more = "more readings reduce the uncertainty"
+    return f"{check}recalibrate {parts or links}, with {earlier} as prior; {more}."
 
 
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     """Return the command line for the next step; None without one."""
     if c.another_arm:
         return f"hilcal refine {quoted(later)}"
-    changed = any(x.candidate.of_arm for x in c.changes.found) or not c.changes.explained
+    possible = (o for x in c.changes.found for o in x.possible)
+    changed = any(o.of_arm for o in possible) or not c.changes.explained
     return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
 
 

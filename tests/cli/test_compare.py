@@ -95,6 +95,20 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys)
 
 
 @pytest.mark.long
+def test_a_shifted_target_is_checked_before_the_last_link_is_calibrated_again(site, capsys):
+    world = site.arm.world
+    shifted = world.physics.target_offset + np.array([3e-4, -1e-4, 2e-4])
+    world = replace(world, physics=world.physics.with_effect("target_offset", shifted))
+    readings = remeasured(world, site.arm.loads, 15, np.random.default_rng(3))
+    path = site.store("shifted.hilcal", readings)
+    words = " ".join(ok(capsys, "compare", site.earlier, path, "--same-setup").out.split())
+    assert "do not distinguish it from the geometry of link 6" in words
+    assert "Next: check the target's place on the tool; only if that is as it was" in words
+    assert "recalibrate link 6," in words
+    assert "Not of the arm" not in words
+
+
+@pytest.mark.long
 def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(site, capsys):
     rng = np.random.default_rng(9)
     path = site.store("whole.hilcal", measured(site.arm.world, site.arm.loads, 20, rng))

@@ -100,6 +100,16 @@ def test_a_target_that_was_mounted_anew_is_no_change_of_the_arm(arm):
     assert np.abs([s.value for s in moved.sizes] - shift).max() < 5e-5
 
 
+def test_the_last_link_and_the_target_are_not_told_apart_by_what_positions_do_not_show(arm):
+    moved = 1e-4 * np.array([3.0, -2.0, 3.0, 4.0, -3.0, 3.0]) * np.eye(7)[6][:, None]
+    found = later(
+        arm, lambda p: p.with_effect("link_geometry", p.link_geometry + moved), 46, count=20
+    )
+    (change,) = found.found
+    assert {c.name for c in change.possible} == {"target_offset", "link_geometry.link6"}
+    assert max(abs(s.value) for s in change.sizes) < 1e-3
+
+
 def test_a_tool_that_is_heavier_is_what_its_columns_say(arm):
     fit = arm.earlier.fit
     states = fit.readings.states[:20]
