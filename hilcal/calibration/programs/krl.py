@@ -8,8 +8,9 @@ each axis at a negative angle; the controller obeys both in PTP motions and neit
 Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`,
 `BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`). Values that are set within a
 branch or a loop are unknown after its end, and both after the call of a subprogram, which may set
-them. The mass at the flange is M of `$LOAD`, which `BAS(#TOOL, n)` and an inline form set to
-`LOAD_DATA[n]`; a negative one is not stated.
+them. A frame is unknown if a statement changes it otherwise than as a whole. The mass at the flange
+is M of `$LOAD`, which `BAS(#TOOL, n)` and an inline form set to `LOAD_DATA[n]`; a negative one is
+not stated.
 
 Source: KUKA, *KUKA System Software 8.3, Operating and Programming Instructions for System
 Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
@@ -61,7 +62,10 @@ _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
 _LOAD = re.compile(r"^\s*\$LOAD\s*(\.\s*M\s*)?=\s*(.+)$", re.IGNORECASE)
 _MASS = re.compile(rf"\bM\s+({DECIMAL}(?:[eE][-+]?\d+)?)\s*(?=[,}}]|$)", re.IGNORECASE)
 _BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
-_FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
+_FDAT = re.compile(r"^\s*FDAT_ACT\b\s*(?:=\s*(\w+))?", re.IGNORECASE)
+_CHANGED = re.compile(
+    r"^\s*([A-Za-z_]\w*)\s*(\[\s*\d+\s*\]|\[[^\]]*\])?\s*(\.[\w.\s]*)?=(?!=)", re.IGNORECASE
+)
 _INDEX = re.compile(r"^(TOOL|BASE)_DATA\s*\[\s*(\d+)\s*\]$", re.IGNORECASE)
 _OPENS = ("IF", "SWITCH", "FOR", "WHILE", "LOOP", "REPEAT", "SPLINE", "PTP_SPLINE")
 _LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
@@ -203,6 +207,7 @@ class _KrlReader(ProgramReader):
     def read(self, texts: Sequence[str], suffixes: Sequence[str]) -> Program:
         lines = list(_code(texts[0]))
         self.used = self._used_otherwise(lines)
+        self.changed = _changed(lines)
         blocks: list[list[_State]] = []  # states at the beginning and after branches of open blocks
         for k, (line, offset, code) in enumerate(lines):
             word = _word(code)
@@ -261,6 +266,9 @@ class _KrlReader(ProgramReader):
 
     def _of_form(self, name: str | None, line: int, kinds: Sequence[str] = KINDS) -> None:
         values = self.data.get(_key(name or ""), [])
+        if changed := self._change_of(name or ""):
+            self.state = _State(changed, changed)
+            return
         if len(values) != 1 or "TOOL_NO" not in values[0].fields:
             reason = f"the FDAT of line {line} is not in the .dat file"
             self.state = _State(reason, reason)
@@ -286,6 +294,12 @@ class _KrlReader(ProgramReader):
     def _set(self, kind: str, value: str, line: int) -> None:
         self.state = replace(self.state, **{kind.lower(): self._frame(kind, value, line)})
 
+    def _change_of(self, name: str) -> str:
+        """Return the statement that changes a frame or form, or an element of its array, if any."""
+        key = _key(name)
+        line = self.changed.get(key) or self.changed.get(key.partition("[")[0])
+        return f"line {line} changes {name}" if line else ""
+
     def _numbers(self, name: str) -> Floats | None:
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
@@ -297,13 +311,18 @@ class _KrlReader(ProgramReader):
             numbers = _Value.of(value, 0, 0, line).numbers(POSE)
             return f"${kind} of line {line} is incomplete" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
+        fixed = m is not None and m[2] == "0"  # the flange, or the world
+        if not fixed and (changed := self._change_of(value)):
+            return changed
         if m is None or m[1].upper() != kind:
             numbers = self._numbers(value)
             return f"${kind} of line {line} is computed" if numbers is None else of_euler(numbers)
         group, name = ("tools", "bases")[kind == "BASE"], f"{kind}_DATA[{m[2]}]"
-        numbers = self._numbers(name)
-        if numbers is not None and self.controller.stated(group, m[2]) is None:
+        numbers, stated = self._numbers(name), self.controller.stated(group, m[2])
+        if numbers is not None and stated is None:
             return of_euler(numbers)
+        if stated is not None and (assigned := [v for v in self.data.get(name, []) if not v.file]):
+            return f"line {assigned[0].line} sets {name}, which --frames states, too"
         return self.controller.pose(group, m[2], name)
 
     def _with(self, code: str, line: int) -> None:
@@ -394,6 +413,19 @@ class _KrlReader(ProgramReader):
                 for key in keys.get(name, ()):
                     out.setdefault(key, line)
         return out
+
+
+def _changed(lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
+    """Return the lines that assign names otherwise than as a whole: a field, or what is computed.
+
+    For an element with a computed index it is the name of the array.
+    """
+    out: dict[str, int] = {}
+    for line, _, code in lines:
+        if (m := _CHANGED.match(code)) and not _DATA.match(code):
+            index = _key(m[2] or "")
+            out.setdefault(_key(m[1]) + index * index[1:-1].isdigit(), line)
+    return out
 
 
 def _value(text: str) -> float:

@@ -341,6 +341,48 @@ def test_frames_on_some_ways_only_are_not_known(arms, tmp_path):
     refusal("the loop of line 37 sets them later", read, "krl", arms, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("statement", "changed", "left"),
+    [
+        ("BASE_DATA[2].X = 500.0", "BASE_DATA[2]", ["XP1", "XP2", "line 39", "line 40"]),
+        ("BASE_DATA[i].X = 500.0", "BASE_DATA[2]", ["XP1", "XP2", "line 39", "line 40"]),
+        (
+            "TOOL_DATA[ 1 ] = measured()",
+            "TOOL_DATA[1]",
+            ["XP1", "XP2", "XP3", "line 39", "line 40"],
+        ),
+        ("FP2.BASE_NO = 3", "FP2", ["XP2"]),
+        ("TOOL_DATA[3].X = 5.0", "", []),
+    ],
+)
+def test_points_of_a_frame_that_the_program_changes_are_left(
+    statement, changed, left, arms, tmp_path
+):
+    copied("krl", tmp_path, lambda t: t.replace("PTP XP1", f"PTP XP1\r\n{statement}"))
+    found = [p for p in read("krl", arms, tmp_path, leave=True).program.points if p.not_corrected]
+    assert [p.name.partition(" (")[0] for p in found] == left
+    assert all(p.not_corrected.endswith(f"changes {changed}") for p in found)
+
+
+def test_a_form_that_is_written_into_the_program_replaces_the_one_before(arms, tmp_path):
+    form = "FDAT_ACT={TOOL_NO 1,BASE_NO 3,IPO_FRAME #BASE}"
+    copied("krl", tmp_path, lambda t: t.replace("FDAT_ACT=FP2", form))
+    points = read("krl", arms, tmp_path, leave=True).program.points
+    (left,) = [p for p in points if p.not_corrected]
+    assert left.name.startswith("XP2")
+
+
+def test_a_base_that_the_program_sets_is_not_that_of_the_frames_file(arms, tmp_path):
+    copied(
+        "krl", tmp_path, lambda t: t.replace("PTP XP1", "BASE_DATA[2]={X 1,Y 2,Z 3,A 0,B 0,C 0}")
+    )
+    frames = tmp_path / "frames.toml"
+    frames.write_text("tools.1 = [0, 0, 100, 0, 0, 0]\nbases.2 = [800, -200, 150, 30, 0, 0]\n")
+    points = read_program(tmp_path / "weld.src", arms["krl"], frames=frames, leave=True)
+    (xp2,) = [p for p in points.program.points if p.name.startswith("XP2")]
+    assert xp2.not_corrected == "line 20 sets BASE_DATA[2], which --frames states, too"
+
+
 def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path):
     """A UR arm: no spherical wrist, so that S and cfx are not read, and that is said."""
     arm = load_arm("ur10e")
