@@ -54,6 +54,7 @@ LEAST = 1e-8  # least variance, and least information on a parameter of an arm, 
 FARTHEST = 10.0  # how far an arm's parameters may be off, in ordinary magnitudes; a choice
 START = (1.0, 0.05)  # variances τ², ω² at the start of EM
 UNDETERMINED = 5.0  # standard uncertainty, ordinary magnitudes, from which nothing is tested
+TAIL = 0.025  # probability on either side of an interval of 95 %
 FALSE_ALARM = 0.01  # probability that an element is named in a fleet without outliers
 FEWEST = 5  # least number of arms for the test for outliers: three hardly have a spread
 # Spreads τ between units, in ordinary magnitudes, and the means and widths of the prior of log τ
@@ -223,9 +224,16 @@ class Hierarchy:
 
     @property
     def predictive(self) -> Floats:
-        """(K, K) covariance of a further arm's parameters in its first campaign."""
+        """(K, K) covariance of a further arm's parameters in its first campaign.
+
+        A spread of few arms is uncertain: with A arms that determine a parameter, its prediction is
+        Student's with A − 1 degrees of freedom, and the normal one has its 95 % interval.
+        """
         k = len(self.mu)
-        return np.asarray(self.covariance[:k, :k] + np.diag(self.between + self.within))
+        arms = np.sum((self.arm_variance < UNDETERMINED**2) & ~self.outlier, axis=0)
+        wider = scipy.stats.t.isf(TAIL, np.maximum(arms - 1, 1)) / scipy.stats.norm.isf(TAIL)
+        covariance = self.covariance[:k, :k] + np.diag(self.between + self.within)
+        return np.asarray(covariance * np.outer(wider, wider))
 
     @property
     def between_std_error(self) -> Floats:

@@ -305,7 +305,7 @@ def _prior(
     h: Hierarchy,
     arms: int,
 ) -> Posterior:
-    """Prediction for another arm: N(μ, Cov μ + τ² + ω²)."""
+    """Prediction for another arm: N(μ, Cov μ + τ² + ω²), wider for few arms."""
     information = np.linalg.inv(h.predictive)
     information = (information + information.T) / 2
     ranges: dict[tuple[str, str], tuple[float, float]] = {}

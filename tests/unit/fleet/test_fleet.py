@@ -53,14 +53,14 @@ def one():
     return posterior_of(readings_of(np.ones(6), 1))
 
 
-def members(one, seed, odd=0.0):
-    """30 arms, two months each, whose fits scatter as the posterior of one says."""
+def members(one, seed, odd=0.0, arms=ARMS):
+    """Arms, two months each, whose fits scatter as the posterior of one says."""
     rng = np.random.default_rng(seed)
     scaled = one.information * (one.scale[:, None] * one.scale)
     values, vectors = np.linalg.eigh(scaled)
     root = vectors[:, values > 1e-6] / np.sqrt(values[values > 1e-6])
     found = []
-    for a in range(ARMS):
+    for a in range(arms):
         factors = compliances(rng)
         if a == ODD:
             factors[2] += odd
@@ -127,6 +127,19 @@ def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
         ("creep", "defect", (f"arm{ODD}",))
     ]
     assert not found.wear
+
+
+def test_the_prior_of_a_few_arms_is_as_wide_as_their_spread_is_uncertain(one):
+    rng, inside = np.random.default_rng(8), []
+    for seed in range(24):
+        prior = pool(members(one, 200 + seed, arms=4), ()).prior
+        joint = [one.names.index(name) for name in prior.names]
+        std = np.sqrt(np.diag(np.linalg.inv(prior.information)))
+        factors = dict(zip(one.names, compliances(rng), strict=False))
+        true = one.mean[joint] * [factors[name] for name in prior.names]
+        inside += (np.abs(true - prior.mean) < 1.96 * std).tolist()
+    assert len(inside) > 100
+    assert 0.9 < np.mean(inside) < 1.0
 
 
 def test_in_an_ordinary_fleet_nobody_is_named(one):
