@@ -109,7 +109,9 @@ def decision_report(
     `goal_m` is None without a goal; `clock` is in cell seconds per real second.
     """
     band = length(d.error.now_m)
-    yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {band}."
+    share = f"{100 * BAND:.0f} % of the points within {band}"
+    known = "where approach directions and temperatures are known as in these readings"
+    yield f"Predicted after compensation: {share}, {known}."
     goal, then = ("" if x is None else length(x) for x in (goal_m, d.then_m))
     cost = f"further readings ({cell_duration(d.seconds, clock)})"
     cost = "" if d.plan is None else f"{len(d.plan.steps)} {cost}"
