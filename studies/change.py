@@ -29,7 +29,7 @@ from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.carried.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.identification.fit import fit
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, States
 from hilcal.regression.evidence import noncentrality_of_power
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states
@@ -91,6 +91,7 @@ class ChangeCase:
         z: (estimated − true)/standard deviation of the zero and of the compliance, where found.
         of_arm: whether a change of the arm itself is named.
         explained: whether the residual is scatter.
+        set_aside: number of readings that are called gross errors, wrongly.
         failure: reason for no answer.
     """
 
@@ -111,6 +112,7 @@ class ChangeCase:
     z: tuple[float, ...] = ()
     of_arm: bool = False
     explained: bool = True
+    set_aside: int = 0
     failure: str = ""
 
     @property
@@ -240,17 +242,20 @@ def case(
     changed = replace(world, physics=physics.with_effect("joint_compliance", compliance))
     loads, warmer = (arm.others, WARMER) if other else (arm.loads, 0.0)
     readings = remeasured(changed, loads, count, rng, warmer)
-    moved = (
-        changed.ideal_readings(readings.states).position
-        - world.ideal_readings(readings.states).position
-    )
-    rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+    def moved(states: States) -> Floats:
+        """Return the displacement (N, 3) of the target by the repair, m."""
+        before = world.ideal_readings(states).position
+        return np.asarray(changed.ideal_readings(states).position - before)
+
+    rms = float(np.sqrt(np.mean(np.sum(moved(readings.states) ** 2, axis=1))))
     repaired = ChangeCase(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
     try:
         changes = find_changes(later_readings(arm.earlier, readings, anew=anew))
     except HilcalError as error:
         return replace(repaired, failure=str(error))
-    return judged(repaired, changes, moved, change)
+    of_kept = moved(changes.before.later.readings.states)
+    return judged(repaired, changes, of_kept, change)
 
 
 def judged(repaired: ChangeCase, changes: Changes, moved: Floats, change: float) -> ChangeCase:
@@ -259,7 +264,8 @@ def judged(repaired: ChangeCase, changes: Changes, moved: Floats, change: float)
     Args:
         repaired: the case.
         changes: the answer.
-        moved: (N, 3) displacement of the target by the change in each reading, m.
+        moved: (N, 3) displacement of the target by the change in each reading that was not set
+            aside, m.
         change: of the joint's compliance, rad/(N·m).
     """
     test, first = changes.before, changes.found[0] if changes.found else None
@@ -288,4 +294,5 @@ def judged(repaired: ChangeCase, changes: Changes, moved: Floats, change: float)
         of_arm=any(c.candidate.of_arm for c in changes.found),
         z=z,
         explained=changes.explained,
+        set_aside=len(changes.gross),
     )

@@ -133,7 +133,8 @@ def figures_of(cases: Sequence[ChangeCase]) -> list[Figure]:
     quiet = [c for c in cases if c.repair == "nothing"]
     repaired = [c for c in cases if c.repair != "nothing"]
     visible = [c for c in repaired if c.visible]
-    out = []
+    right = [not c.set_aside for c in cases]
+    out = [_rate("no reading is set aside as a gross error, which none has", cases, right, 0.98)]
     if repaired:
         out += [
             _rate("repaired joint named, and no other part", repaired, [c.found for c in repaired]),
