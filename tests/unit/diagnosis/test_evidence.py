@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.evidence import REDUNDANCY_LEVEL, backward_elimination, model_columns
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
-from hilcal.diagnosis.verdict import diagnose
+from hilcal.diagnosis.verdict import IMITATION, diagnose
 from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import linearisation as columns_module
@@ -42,15 +42,15 @@ from tests.support.refusals import refusal
     ],
 )
 def test_a_law_that_only_resembles_an_effect_is_unknown(mode, law, variable, seeds):
-    """Of few readings no suspect is named; of many the whole catalogue is tried."""
+    """Few readings name a suspect only where it explains most; then the catalogue is tried."""
     led = 0
     for seed, poses in product(seeds, (30, 110)):
         d = diagnose(studied(mode, law, seed=seed, n_poses=poses))
         assert d.verdict == "unknown_effect", (seed, message(d))
         assert variable in [c.variable for c in d.dependences[:2]]
-        assert poses == 110 or d.significant == ()
         led += d.lead is not None
         if d.lead is not None:
+            assert poses == 110 or d.lead.holdout_share > IMITATION
             check_insufficiency(d)
     assert led > 0
 
