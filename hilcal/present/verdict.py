@@ -353,6 +353,8 @@ def _no_suspect(d: Diagnosis) -> list[str]:
             but = implausible(best)
         elif not best.keeps:
             but = unconfirmed(best)
+        elif best.refuted and not tried and best.left_out().significant:
+            but = "may only resemble the missing effect"
         none = (
             f"The best effect of the catalogue, {best.effect}, explains {percent(best.share)} "
             f"of it, but {but}."

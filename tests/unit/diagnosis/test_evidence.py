@@ -49,6 +49,8 @@ def test_a_law_that_only_resembles_an_effect_is_unknown(mode, law, variable, see
         assert d.verdict == "unknown_effect", (seed, message(d))
         assert variable in [c.variable for c in d.dependences[:2]]
         led += d.lead is not None
+        resembles = d.lead is not None or d.suspects[0].refuted
+        assert ("may only resemble the missing effect" in message(d)) == resembles
         if d.lead is not None:
             assert poses == 110 or d.lead.holdout_share > IMITATION
             check_insufficiency(d)
