@@ -276,17 +276,18 @@ def next_(
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
-    t.show(f"The plan is in {output}.")
-    _show_adding(t, run, output, cell, planned.appendable)
+    _show_adding(t, run, output, cell, planned.appendable, f"The plan is in {output}. ")
     t.document(
         checked_plan.to_dict(), plan=str(output), suspects=list(effects), **separates(chosen)
     )
 
 
-def _show_adding(t: Terminal, run: Path, plan: Path, cell: Path | None, appendable: bool) -> None:
+def _show_adding(
+    t: Terminal, run: Path, plan: Path, cell: Path | None, appendable: bool, where: str = ""
+) -> None:
     """Print the commands that add the readings of a further plan to a campaign."""
     how, *commands = adding_lines(run, plan, cell, appendable)
-    t.show(how)
+    t.show(where + how)
     for line in commands:
         t.command(line)
 
