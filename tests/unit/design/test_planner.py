@@ -173,6 +173,7 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
     assert "More would give, predicted for the deflection: 30 poses ±" in words
 
 
+@pytest.mark.long
 def test_criteria_are_compared_only_where_they_are_shown(tmp_path, capsys):
     words = ("plan", cell_file(tmp_path, small()), "-o", tmp_path / "p.json", "--poses", "3")
     assert "comparing numbers of poses" in ok(capsys, *words).err
