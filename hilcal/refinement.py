@@ -432,7 +432,7 @@ class Path:
         neither the noise nor an unknown effect. They stay as the model's background if the error on
         poses left out falls by a share (`background_is_better`); also by more than it scatters from
         pose to pose where, by the verdict `unknown_effect`, they may imitate an effect that the
-        catalogue lacks. Where the fit has spent more than half of the readings' degrees of freedom,
+        catalogue lacks. Where the fit has used more than half of the readings' degrees of freedom,
         its small residual proves nothing: they are tried, and stay unless the error on poses left
         out rises beyond chance. See `_append_background` for their names.
         """
@@ -447,11 +447,11 @@ class Path:
         self._background_tried = True
         if not allows_background(last.fit):
             return False
-        few = last.fit.dof < last.fit.whitening.rank / 2
+        mostly_used = last.fit.dof < last.fit.whitening.rank / 2
         if d.residual_is_noise and last.fit.readings.arm_scatter is None:
             # The residual of serially correlated noise resembles effects.
             serial = last.fit.readings.serial is not None
-            if serial or (not few and p_value_of_others(last.fit) > JOINT_LEVEL):
+            if serial or (not mostly_used and p_value_of_others(last.fit) > JOINT_LEVEL):
                 return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
@@ -463,7 +463,10 @@ class Path:
                 named = fit_again(named, outlier=fitted.outlier | named.outlier)
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
-        if predicts_better(fitted, named) if few else not background_is_better(named, fitted):
+        better = background_is_better(named, fitted)
+        if mostly_used:
+            better = not predicts_better(fitted, named)
+        if not better:
             return False
         if d.verdict == "unknown_effect":
             share = explained_share(named, fitted)

@@ -62,7 +62,7 @@ from hilcal.refinement import refine as refine_model
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
-from hilcal.transfer.compare import other_serial_number
+from hilcal.transfer.compare import different_serial_numbers
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
 
@@ -391,6 +391,14 @@ def _effects_against(
     }
 
 
+def _warn_of_another_arm(t: Terminal, first: Campaign, second: Campaign) -> None:
+    if numbered := different_serial_numbers(first, second):
+        t.notice(
+            f"warning: {second.path}: the serial number of its arm is {numbered[1]}, that of "
+            f"{first.path} is {numbered[0]}: what differs may be the arm"
+        )
+
+
 @command("""
     later | LATER.hilcal | Show what has changed on the arm since RUN.hilcal: a later campaign of
         15 readings or more.
@@ -414,8 +422,7 @@ def compare(
     ):
         if o.in_use(revision) is None:
             t.notice(f"{run}: no revision yet, using the baseline; hilcal refine makes a model")
-        if warning := other_serial_number(o, later_run):
-            t.notice(f"warning: {warning}")
+        _warn_of_another_arm(t, o, later_run)
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=same_setup or None, say=say
         )
@@ -478,8 +485,7 @@ def validate(
         Campaign.open(other, read_only=True) as unseen,
         working(t.progress) as say,
     ):
-        if warning := other_serial_number(o, unseen):
-            t.notice(f"warning: {warning}")
+        _warn_of_another_arm(t, o, unseen)
         record = fitting.record_of(t, o, say, revision)
         result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
         name = model_name(fitting.effect_titles(result.model, o.fitted_readings(record)))

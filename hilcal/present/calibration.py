@@ -62,10 +62,12 @@ MOST_NOT_CORRECTED, MOST_POINTS = 6, 12  # listed points: without a correction, 
 MOST_VARIABLES, MOST_POSES = 4, 6  # listed variables; listed poses
 FAR_TURN_RAD = np.radians(5.0)  # correction of a joint that is warned of; arms' errors are 0.1°
 MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
-FEW = 0.05  # largest share of measurements that can be gross errors of a validation; a choice
+MOST_GROSS_SHARE = (
+    0.05  # largest share of measurements that can be gross errors of a validation; a choice
+)
 NEXT = {
     "register": "If the tracker was moved before these readings: --register fits its place first.",
-    "compare": "hilcal compare RUN OTHER says what has changed.",
+    "compare": "hilcal compare says what has changed.",
 }
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDE_RATIO = 1.5
@@ -428,7 +430,7 @@ def validation_report(
     if step := next_of(test, beyond):
         yield f"{NEXT[step]}\n"
     if (few := _far_alone(beyond)).any():
-        yield _alone(test, beyond, few)
+        yield _gross_error_note(test, beyond, few)
 
 
 def next_of(test: validation.Validation, beyond: validation.Extrapolation) -> str:
@@ -442,11 +444,13 @@ def next_of(test: validation.Validation, beyond: validation.Extrapolation) -> st
 def _far_alone(beyond: validation.Extrapolation) -> Bools:
     """Return the few measurements (D,) that are far off while all others are as stated."""
     far = beyond.z > MOVED_TRACKER_RATIO
-    few = 0 < far.sum() <= max(1.0, FEW * len(far)) and not far.all()
+    few = 0 < far.sum() <= max(1.0, MOST_GROSS_SHARE * len(far)) and not far.all()
     return far if few and _rms(beyond.z[~far]) <= MIN_ERROR_RATIO else np.zeros_like(far)
 
 
-def _alone(test: validation.Validation, beyond: validation.Extrapolation, far: Bools) -> str:
+def _gross_error_note(
+    test: validation.Validation, beyond: validation.Extrapolation, far: Bools
+) -> str:
     r, rows = test.readings, test.whitening.reading
     listed = [
         f"{r.pose_names[r.pose[rows[k]]]}/{r.load_names[r.load[rows[k]]]} ({beyond.z[k]:.0f} times)"

@@ -131,8 +131,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
             alternatives = numbers.names([part_name(o) for o in change.same_as], "or")
             yield f"  These readings do not distinguish it from {alternatives}."
     yield from ("", _table(changes.found))
-    sound = [x.candidate for x in changes.found if not any(o.of_arm for o in x.possible)]
-    if setup := dict.fromkeys(map(part_name, sound)):
+    of_setup = [x.candidate for x in changes.found if not any(o.of_arm for o in x.possible)]
+    if setup := dict.fromkeys(map(part_name, of_setup)):
         yield f"Not of the arm: {numbers.names(list(setup))}."
     yield _remainder(c)
     tests = numbers.many_tests(changes.tested, LEVEL, "candidates")

@@ -283,7 +283,7 @@ def adding_lines(run: Path, plan: Path, cell: Path | None, appendable: bool) -> 
             f"hilcal run {quoted(config)} -o {quoted(run)} --append --plan {quoted(plan)}",
         )
     return (
-        "Add its readings, with new pose names, to the table:",
+        "Export, append its readings (new pose names), import:",
         f"hilcal export {quoted(run)} --readings READINGS.csv",
         f"hilcal import READINGS.csv --config {quoted(config)} -o NEW.hilcal",
     )

@@ -267,17 +267,12 @@ def validate(
     return CampaignValidation(model, judged, prediction, beyond, shares, tool)
 
 
-def other_serial_number(first: Campaign, second: Campaign) -> str:
-    """Return that two campaigns are of arms with different serial numbers; "" where not known."""
+def different_serial_numbers(first: Campaign, second: Campaign) -> tuple[str, str] | None:
+    """Return the serial numbers of the arms of two campaigns; None unless known and different."""
     if any(c.file.about(PLAN) is None for c in (first, second)):  # imported
-        return ""
+        return None
     one, two = (RunLog(c.file).serial_number() for c in (first, second))
-    if not one or not two or one == two:
-        return ""
-    return (
-        f"{second.path}: the serial number of its arm is {two}, that of {first.path} is {one}: "
-        "what differs may be the arm"
-    )
+    return (one, two) if one and two and one != two else None
 
 
 def _tool_differs(first: Campaign, second: Campaign) -> tuple[str, ...]:

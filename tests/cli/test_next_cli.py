@@ -9,7 +9,15 @@ import pytest
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
+from hilcal.store.plan import (
+    REFERENCE,
+    Plan,
+    Step,
+    joined,
+    load_plan,
+    unknown_keys,
+    with_new_names,
+)
 from hilcal.store.run_log import RunLog, create_run
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
@@ -44,6 +52,7 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     assert all(0 <= now[e, f] < p <= 1 for e, f, p in d["separates"])
     assert 0.9 < d["efficiency"] <= 1
     made = load_plan(plan)
+    assert unknown_keys(made) == ()
     assert d["readings"] == len(made.steps)
     assert made.about["suspects"] == [BASE, TILT]
     assert d["poses"] > 0

@@ -26,7 +26,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.route import dry_run
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, unknown_keys
 from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
@@ -138,6 +138,7 @@ def test_the_command(tmp_path, capsys):
     result = ok(capsys, *words, "--csv", table, "--json")
     d = result.document
     made = load_plan(plan)
+    assert unknown_keys(made) == ()
     assert d["readings"] == len(made.steps)
     assert d["poses"] == len(made.pose_names) - 1 == 4  # as asked, and under every load
     loads = [load.name for load in small().loads]
