@@ -222,14 +222,14 @@ def with_background(
             mixed = mixed_fit_of(model, sample, fitted.mode)
         if not readings.scatter_stated:
             readings = with_arm_scatter(model.cell, readings, _scatter(mixed))
-        inliers = readings[~outlier]
-        if len(sample) < len(inliers):
+        inliers, added = readings[~outlier], set(model.names) - set(fitted.model.names)
+        implausible = _implausible(mixed, added)
+        if implausible is None and len(sample) < len(inliers):
             inliers = replace(inliers, scatter_stated=True)
             mixed = mixed_fit_of(model, inliers, fitted.mode, start=mixed)
-        sizes = _plausible_shares(mixed, set(model.names) - set(fitted.model.names))
-        largest = max(sizes, key=sizes.__getitem__, default="")
-        if sizes and sizes[largest] > IMPLAUSIBLE_FACTOR:
-            return with_background(fitted, named, (*without, largest))
+            implausible = _implausible(mixed, added)
+        if implausible is not None:
+            return with_background(fitted, named, (*without, implausible))
         return fit(
             background_model(mixed, named), readings, fitted.mode, start=mixed.theta,
             outlier=outlier if search else None,
@@ -271,14 +271,16 @@ def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
         return None
 
 
-def _plausible_shares(mixed: MixedFit, effects: Collection[str]) -> dict[str, float]:
-    """Largest standard deviation of each effect, over its plausible size."""
+def _implausible(mixed: MixedFit, effects: Collection[str]) -> str | None:
+    """Return the effect that exceeds its plausible size most; None where none does."""
     std = mixed.prior_std()
-    return {
+    share = {
         effect.name: float(np.max(std[rows] / (effect.most() * effect.magnitudes)))
         for effect, rows in zip(mixed.model.effects, mixed.model.slices(), strict=True)
         if effect.name in effects
     }
+    largest = max(share, key=share.__getitem__, default=None)
+    return largest if largest and share[largest] > IMPLAUSIBLE_FACTOR else None
 
 
 def _scatter(mixed: MixedFit) -> ArmScatter:

@@ -7,19 +7,18 @@ parameters that the mixed model predicts, until these converge.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES, EffectSpec
-from hilcal.errors import CannotAnswerError
-from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.gauss_newton import shortened, whitened_jacobian
 from hilcal.identification.noise.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual
-from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import Families, LogStdPrior, families_of
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import Variances, coordinates_covariance, estimate_variances
-from hilcal.model.model import Model
+from hilcal.model.model import Model, Prediction
 from hilcal.readings.covariance import scatter_alone
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Whitening, whitening
@@ -169,7 +168,8 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
         readings = replace(readings, scatter_stated=True)
     else:
         readings = readings.as_stated()
-    problem = _linearise(model, readings, whitening(readings, mode, "gc"), theta).problem
+    rows = _rows(model, readings, whitening(readings, mode, "gc"))
+    problem = rows.linearised(rows.at(theta), families_of(model))
     return problem.compressed() if many else problem
 
 
@@ -181,7 +181,7 @@ def shift_rows(model: Model, readings: Readings, mode: Mode) -> Floats:
     readings = readings.as_stated()
     w, count = whitening(readings, mode, "gc"), readings.value.size
     shifts = np.eye(count).reshape(len(readings), readings.m, count)
-    rows, _ = _noise(model, readings, w, w.whiten_readings(shifts))
+    rows = _rows(model, readings, w).turned(w.whiten_readings(shifts))
     return rows.reshape(len(rows), len(readings), readings.m)
 
 
@@ -226,96 +226,111 @@ def _iterated(
     A step that increases the penalised squares is halved, as large parameters that cancel in the
     linear model do not cancel exactly.
     """
-    theta = np.zeros(model.size) if start is None else start.theta
-    point, rounds = _linearise(model, readings, w, theta, families, parts), 0
-    log_std = None if start is None else start.variances.log_std[: len(point.problem.priors)]
-    while True:
-        variances = estimate_variances(point.problem.compressed(), log_std, search=True)
-        log_std, rounds = variances.log_std, rounds + 1
-        square = point.penalised(theta, variances.equations)
-        step = point.problem.parameters(variances.equations.coordinates, model.size) - theta
-        for k in range(HALVINGS):
-            reached = theta + 0.5**k * step
-            try:
-                trial = _linearise(model, readings, w, reached, families, parts)
-            except CannotAnswerError:  # no equilibrium: the step is too long
-                continue
-            if trial.penalised(reached, variances.equations) <= square:
-                break
-        else:
-            return variances, theta
-        moved = float(np.sqrt(np.mean((trial.white - point.white) ** 2)))
-        theta, point = reached, trial
-        if rounds == MOST_LINEARISATIONS or moved < CONVERGED:
-            return variances, theta
+    rows = _rows(model, readings, w, parts)
+    families = families or families_of(model)
+    point, log_std = rows.at(np.zeros(model.size)), None
+    if start is not None:
+        point, count = rows.at(start.theta), len(families.random) + len(rows.noise)
+        log_std = start.variances.log_std[:count]
+    for _ in range(MOST_LINEARISATIONS):
+        problem = rows.linearised(point, families)
+        variances = estimate_variances(problem.compressed(), log_std, search=True)
+        log_std, previous = variances.log_std, point
+        aim = problem.parameters(variances.equations.coordinates, model.size)
+        cost = partial(_penalised, problem=problem, log_std=log_std)
+        along = partial(rows.along, previous)
+        reached = shortened(along, aim - previous.theta, HALVINGS, cost, cost(previous))
+        if reached is None:
+            break
+        point = reached
+        if float(np.sqrt(np.mean((point.white - previous.white) ** 2))) < CONVERGED:
+            break
+    return variances, point.theta
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Linearised:
-    """A linear problem at some parameters."""
+class _Point:
+    """The residual at some parameters."""
 
-    problem: MixedProblem
-    white: Floats  # (R,) residual at the parameters, in the rows of the problem
-
-    def penalised(self, theta: Floats, equations: Equations) -> float:
-        """Squares of the residual and of the parameters (P,), in their standard deviations."""
-        penalty = sum(
-            float(np.sum((theta[f.parameters] / (s * f.magnitude)) ** 2))
-            for f, s in zip(self.problem.families.random, np.exp(equations.log_std), strict=False)
-        )
-        problem, families = self.problem, len(self.problem.families.random)
-        noise_std = problem.noise_std(equations.log_std[families:])
-        return float(np.sum((self.white / noise_std) ** 2)) + penalty
+    theta: Floats  # (P,)
+    prediction: Prediction
+    white: Floats  # (R,) in the rows of the problem
 
 
-def _linearise(
-    model: Model,
-    readings: Readings,
-    w: Whitening,
-    theta: Floats,
-    families: Families | None = None,
-    parts: Sequence[NoisePart] = (),
-) -> _Linearised:
-    """Linearise at theta (P,)."""
-    prediction = model.predict(readings.states, theta)
-    white = w.whiten(residual(readings, prediction, w)).reshape(-1)
-    jacobian = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
-    rows = np.column_stack([white, jacobian])
-    if parts:
-        rows, noise = _noise_of(parts, readings, w, rows)
-    else:
-        rows, noise = _noise(model, readings, w, rows)
-    white, jacobian = rows[:, 0], rows[:, 1:]
-    problem = mixed_problem(
-        white + jacobian @ theta, jacobian, families or families_of(model), noise
+def _penalised(point: _Point, problem: MixedProblem, log_std: Floats) -> float:
+    """Squares of the residual and of the parameters, in their standard deviations."""
+    random = problem.families.random
+    penalty = sum(
+        float(np.sum((point.theta[f.parameters] / (s * f.magnitude)) ** 2))
+        for f, s in zip(random, np.exp(log_std), strict=False)
     )
-    return _Linearised(problem, white)
+    noise_std = problem.noise_std(log_std[len(random) :])
+    return float(np.sum((point.white / noise_std) ** 2)) + penalty
 
 
-def _noise(
-    model: Model, readings: Readings, w: Whitening, rows: Floats
-) -> tuple[Floats, list[Noise]]:
-    """Return whitened rows (R, ...), turned so that all noise is diagonal, and its components.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Whitened rows of readings, turned so that all noise is diagonal."""
 
-    The components are the instrument and, unless stated in the readings, the arm's scatter.
+    model: Model
+    readings: Readings
+    w: Whitening
+    bases: tuple[Floats, ...]  # (G, S, S) U of each bucket of rows; empty where none is turned
+    noise: tuple[Noise, ...]  # its components
+
+    def turned(self, rows: Floats) -> Floats:
+        """Uᵀ times the whitened rows (R, ...) of each bucket."""
+        out, start = rows.copy(), 0
+        for u in self.bases:
+            block = slice(start, start + u.shape[0] * u.shape[1])
+            of_bucket = rows[block].reshape(*u.shape[:2], -1)
+            out[block] = (np.swapaxes(u, 1, 2) @ of_bucket).reshape(out[block].shape)
+            start = block.stop
+        return out
+
+    def at(self, theta: Floats) -> _Point:
+        """Return the residual at the parameters (P,)."""
+        prediction = self.model.predict(self.readings.states, theta)
+        white = self.w.whiten(residual(self.readings, prediction, self.w)).reshape(-1)
+        return _Point(theta, prediction, self.turned(white))
+
+    def along(self, point: _Point, step: Floats) -> _Point:
+        """Return the residual at a point plus a step (P,)."""
+        return self.at(point.theta + step)
+
+    def linearised(self, point: _Point, families: Families) -> MixedProblem:
+        """Return the linear problem at a point."""
+        live = np.arange(self.model.size)
+        columns = whitened_jacobian(self.model, point.prediction, point.theta, self.w, live)
+        columns = self.turned(columns)
+        return mixed_problem(point.white + columns @ point.theta, columns, families, self.noise)
+
+
+def _rows(model: Model, readings: Readings, w: Whitening, parts: Sequence[NoisePart] = ()) -> _Rows:
+    """Return the rows of readings with the `parts` of the noise, or with two.
+
+    These are the instrument and, unless stated in the readings, the arm's scatter.
     """
+    if parts:
+        return _Rows(model, readings, w, *_diagonal_parts(parts, readings, w))
     prior = LogStdPrior(0.0, NOISE_SPREAD)
     measured = [np.any(b.factor != 0, axis=2) for b in w.buckets]
     if readings.scatter_stated:
         unit = np.concatenate([m.reshape(-1) for m in measured]).astype(np.float64)
-        return rows, [Noise(INSTRUMENT, unit, prior)]
+        return _Rows(model, readings, w, (), (Noise(INSTRUMENT, unit, prior),))
     scatter = scatter_alone(readings, _scatter_factors(model, readings))
     blocks = zip(whitened_blocks(scatter, w), measured, strict=True)
     bases, variances = zip(*(independent_rows(c, m) for c, m in blocks), strict=True)
     variance = np.concatenate([v.reshape(-1) for v in variances])
     instrument = Noise(INSTRUMENT, (variance > UNMEASURED_THRESHOLD).astype(np.float64), prior)
-    return _turned(rows, bases), [instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)]
+    noise = instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)
+    return _Rows(model, readings, w, bases, noise)
 
 
-def _noise_of(
-    parts: Sequence[NoisePart], readings: Readings, w: Whitening, rows: Floats
-) -> tuple[Floats, list[Noise]]:
-    """Return whitened rows (R, ...), turned so that the parts of the noise are diagonal; the parts.
+def _diagonal_parts(
+    parts: Sequence[NoisePart], readings: Readings, w: Whitening
+) -> tuple[tuple[Floats, ...], tuple[Noise, ...]]:
+    """Return U (G, S, S) of each bucket, which turns the parts of the noise, and the turned parts.
 
     The sum of the instrument's parts whitens the rows, so that the parts share their eigenvectors.
     Of the last part, the arm's, correlations between different instrument parts are neglected.
@@ -334,21 +349,10 @@ def _noise_of(
         bases.append(u)
         for variance, x in zip(variances, blocks, strict=True):
             variance.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
-    return _turned(rows, bases), [
+    return tuple(bases), tuple(
         Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
         for p, v in zip(parts, variances, strict=True)
-    ]
-
-
-def _turned(rows: Floats, bases: Sequence[Floats]) -> Floats:
-    """Uᵀ times the rows (R, ...) of each bucket, for its bases U (G, S, S)."""
-    out, start = np.empty_like(rows), 0
-    for u in bases:
-        stop = start + u.shape[0] * u.shape[1]
-        block = rows[start:stop].reshape(*u.shape[:2], -1)
-        out[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
-        start = stop
-    return out
+    )
 
 
 def scatter_part(model: Model, readings: Readings) -> NoisePart:

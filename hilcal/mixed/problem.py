@@ -79,10 +79,16 @@ class MixedProblem:
 
     def coordinates(self, jacobian: Floats) -> Floats:
         """Return columns (..., K) from derivatives (..., P) by the model's parameters."""
-        frames = jacobian[..., self.families.frames] @ self.frames
-        random = [jacobian[..., f.parameters] * f.magnitude for f in self.families.random]
-        columns = np.concatenate([frames[..., :0], *random], axis=-1)
-        return np.concatenate([frames, columns - frames @ self.absorbed], axis=-1)
+        out = np.empty((*jacobian.shape[:-1], self.flat + len(self.family)))
+        out[..., : self.flat] = jacobian[..., self.families.frames] @ self.frames
+        start = self.flat
+        for f in self.families.random:
+            stop = start + len(f.parameters)
+            out[..., start:stop] = jacobian[..., f.parameters] * f.magnitude
+            start = stop
+        if self.absorbed.any():
+            out[..., self.flat :] -= out[..., : self.flat] @ self.absorbed
+        return out
 
     def parameters(self, c: Floats, size: int) -> Floats:
         """Return parameters (size, ...) of the model from coordinates (K, ...)."""
