@@ -447,11 +447,10 @@ class Path:
         self._background_tried = True
         if not allows_background(last.fit):
             return False
-        mostly_used = last.fit.dof < last.fit.whitening.rank / 2
         if d.residual_is_noise and last.fit.readings.arm_scatter is None:
             # The residual of serially correlated noise resembles effects.
             serial = last.fit.readings.serial is not None
-            if serial or (not mostly_used and p_value_of_others(last.fit) > JOINT_LEVEL):
+            if serial or (not last.fit.is_saturated and p_value_of_others(last.fit) > JOINT_LEVEL):
                 return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
@@ -464,7 +463,7 @@ class Path:
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
         better = background_is_better(named, fitted)
-        if mostly_used:
+        if last.fit.is_saturated:
             better = not predicts_better(fitted, named)
         if not better:
             return False

@@ -95,7 +95,7 @@ def _show_next_command(
     elif doubt:
         what = "To plan the measurements that separate them:"
         line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
-    elif d.reason in ("background", "unconfirmed_suspect"):
+    elif d.reason in ("background", "few_readings", "unconfirmed_suspect"):
         what = "To plan further poses:"
         line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run)]
     elif d.reason in ("no_suspect", "insufficient_catalogue") and d.step is None:

@@ -50,6 +50,7 @@ Reason = Literal[
     "pose_alone",
     "readings_disagree",
     "serial_or_effect",
+    "few_readings",
     "background",
     "wrong_figure",
 ]
@@ -66,6 +67,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "pose_alone": "ambiguous",
     "readings_disagree": "unknown_effect",
     "serial_or_effect": "ambiguous",
+    "few_readings": "ambiguous",
     "background": "ambiguous",
     "wrong_figure": "ambiguous",
 }
@@ -210,7 +212,7 @@ class Diagnosis(Shown, Tabular):
     @property
     def residual_is_noise(self) -> bool:
         """Whether the stated noise explains the residual."""
-        return self.reason in ("residual_is_noise", "inseparable_addition")
+        return self.reason in ("residual_is_noise", "inseparable_addition", "few_readings")
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, including the sentence."""

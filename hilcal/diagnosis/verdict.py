@@ -9,7 +9,7 @@ The rules, in this order:
 2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
    `ambiguous`.
 3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
-   replace an addition to the model.
+   replace an addition to the model, or the fit has used more than half of the degrees of freedom.
 4. χ² is too large, and something recorded surely predicts a share of the misfit on poses left out,
    or repeats of a pose have it in common: `unknown_effect`, with that share. If no variable
    predicts it beyond chance, and it is the same under every load of a pose, more poses would
@@ -128,8 +128,13 @@ def diagnose(
 
 
 def with_doubts(d: Diagnosis) -> Diagnosis:
-    """Return a diagnosis with the step in the order, or the suspects, that few readings hide."""
-    return with_unconfirmed_suspect(with_order_step(d))
+    """Return a diagnosis with what few readings hide: a step in the order, suspects, or anything.
+
+    A saturated fit (see `Fit.is_saturated`) leaves a small residual even of a wrong model.
+    """
+    d = with_unconfirmed_suspect(with_order_step(d))
+    few = d.reason == "residual_is_noise" and d.fit.is_saturated
+    return replace(d, reason="few_readings") if few else d
 
 
 def with_unconfirmed_suspect(d: Diagnosis) -> Diagnosis:

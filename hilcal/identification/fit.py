@@ -218,6 +218,14 @@ class Fit(WithVarianceFactor, Tabular):
         return int(self.solution.equations.basis.transform.shape[1])
 
     @property
+    def is_saturated(self) -> bool:
+        """Whether the fit has used more than half of the degrees of freedom of the readings.
+
+        Its residual is then small whatever the arm is, and proves nothing.
+        """
+        return self.dof < self.whitening.rank / 2
+
+    @property
     def mahalanobis2(self) -> Floats:
         """(D,) squared Mahalanobis distance of each measurement alone."""
         return mahalanobis2(self.raw, self.whitening.covariance)

@@ -42,7 +42,9 @@ HEADLINES: Mapping[Verdict, str] = {
     "unknown_effect": "unknown effect: an effect is missing that is not in the catalogue",
     "noise_misjudged": "the noise is not what was stated",
 }
-RESIDUAL_IS_NOISE = ("residual_is_noise", "inseparable_addition", "arm_scatter", "background")
+RESIDUAL_IS_NOISE = (
+    "residual_is_noise", "inseparable_addition", "few_readings", "arm_scatter", "background",
+)  # fmt: skip
 """Reasons that call the residual of the fitted poses noise."""
 ALONG = 0.99  # least component of a direction that is named after its axis; a choice
 MANY_TIMES = 3.0  # ratio of errors from which the verdict names the one on poses left out; a choice
@@ -60,6 +62,8 @@ def headline(d: Diagnosis) -> str:
         return "in doubt: more is left than the stated noise, and nothing recorded explains it"
     if d.reason == "unconfirmed_suspect":
         return "ambiguous: these poses are too few to confirm what is missing"
+    if d.reason == "few_readings":
+        return "ambiguous: these readings are too few to judge the model by"
     if d.reason == "background":
         return "ambiguous: the arm has more effects than these poses prove"
     if d.step is not None:
@@ -177,6 +181,7 @@ def _verdict(d: Diagnosis) -> list[str]:
         "background": _background,
         "arm_scatter": _arm_scatter,
         "pose_alone": _pose_alone,
+        "few_readings": _few_readings,
     }
     if d.reason in of_reason:
         return of_reason[d.reason](d)
@@ -245,6 +250,15 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
     if hidden := few(d.not_shown, MOST_HIDDEN):
         return [f"No effect that these readings could show is missing (they cannot show {hidden})."]
     return ["No effect of the catalogue is missing."]
+
+
+def _few_readings(d: Diagnosis) -> list[str]:
+    total = d.fit.whitening.rank
+    return [
+        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}.",
+        f"But the fit has used {total - d.fit.dof:.0f} of {total} degrees of freedom, so that a "
+        "missing effect would hardly show. Measure more poses.",
+    ]
 
 
 def _background(d: Diagnosis) -> list[str]:

@@ -161,6 +161,8 @@ def _nothing_to_separate(o: Campaign, d: Diagnosis) -> str:
             "effects of the background are not told apart one by one; measure more poses, spread "
             f"over all joints, with: {further}"
         )
+    elif d.reason == "few_readings":
+        why = f"these poses are too few to judge the model by; measure more with: {further}"
     elif d.reason == "unconfirmed_suspect":
         why = (
             f"{d.suspects[0].effect} is the only suspect, and these poses are too few to confirm "

@@ -461,6 +461,8 @@ def in_groups(group: Ints, *first_by: Ints | Bools) -> tuple[Ints, Ints, Ints]:
 
 
 MARGIN = 0.02  # share of the fitted range by which values may exceed it; a choice
+MARGIN_K = 1.0
+"""The same of temperatures: a metre of aluminium grows by 23 µm with it. A choice."""
 FULL_TURN = 2.0 * np.pi
 
 
@@ -481,8 +483,12 @@ class Range:
         return np.asarray(np.minimum(above - (self.high - self.low), FULL_TURN - above))
 
     def beyond(self, values: Floats, *, turning: bool = False) -> Bools:
-        """Which values are outside, by more than `MARGIN` of the range; arguments as of `over`."""
-        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        """Which values are outside, by more than `MARGIN` of the range; arguments as of `over`.
+
+        Temperatures by more than `MARGIN_K`, if that is larger.
+        """
+        least = MARGIN_K if self.unit == "K" else 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        allowed = max(MARGIN * (self.high - self.low), least)
         return np.asarray(self.over(values, turning=turning) > allowed)
 
 

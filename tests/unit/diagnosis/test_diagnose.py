@@ -14,6 +14,7 @@ from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.effects.catalogue import BUILT_IN
+from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
@@ -131,6 +132,18 @@ def test_noise_that_is_stated_far_too_large_is_told_beside_a_background(stated):
     assert last.fit.model.background
     assert last.verdict == "noise_misjudged"
     assert "the stated covariance is too large" in message(last.diagnosis)
+
+
+def test_a_fit_that_uses_most_of_the_readings_proves_nothing():
+    c = study_case(configuration(), "ur5e", "absolute", (), 0.0, 1)
+    unloaded = c.readings[c.readings.load == 0]
+    model = baseline(c.cell, unloaded, "absolute") + EffectSpec("link_geometry")
+    model = model + EffectSpec("joint_compliance")
+    few, many = (
+        diagnose(fit(model, unloaded[:poses], "absolute")) for poses in (18, len(unloaded))
+    )
+    assert (few.verdict, many.verdict) == ("ambiguous", "adequate")
+    assert "has used 31 of 54 degrees of freedom" in message(few)
 
 
 def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
