@@ -47,13 +47,14 @@ _GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d\s*:|\Z)", re.DOTALL)
 _FIELD = re.compile(rf"\b([XYZWPR]|[JE]\d)\s*=([ \t]*{DECIMAL})\s*(mm|deg)")
 _FRAME, _TOOL = (re.compile(rf"\b{word}\s*:\s*(\w+)") for word in ("UF", "UT"))
 _CONFIG = re.compile(r"CONFIG\s*:\s*'([A-Z ]*)((?:,\s*-?\d+\s*)*)'")
-_MOTION = re.compile(r"^\s*\d*\s*:?\s*([JLCAS])\s+(?=P(R)?\s*\[)(.*)", re.DOTALL)
+_MOTION = re.compile(r"^\s*\d*\s*:?\s*([JLCAS])\s+(?=P(R|AL_\w+)?\s*\[)(.*)", re.DOTALL)
 _P = re.compile(r"(?<![A-Z])P\s*\[\s*(?:(\d+)|([^\]]*))")
 _OPTION = re.compile(
     r"\b(Offset|Tool_Offset|VOFFSET|INC|Skip|COORD|ATool_?Offset|BOffset|TPT|RTCP)\b", re.IGNORECASE
 )
 _REFUSED = re.compile(
-    r"\b(UFRAME|UTOOL)\s*\[[^\]]*\]\s*=(?!=)|\$MNUFRAME\w*\s*\[|\$MNUTOOL\w*\s*\["
+    r"\b(UFRAME|UTOOL)\s*\[[^;=]*\]\s*=(?!=)|\$MNUFRAME\w*\s*\[|\$MNUTOOL\w*\s*\["
+    r"|\bTouch\s+Offset\s+PR\b"
 )
 _NUMBERED = re.compile(r"^[ \t]*(\d+)[ \t]*:", re.MULTILINE)
 _TRACKING = re.compile(r"\bLINE_TRACK_SCHEDULE_NUMBER\s*:\s*[1-9]\d*")
@@ -120,7 +121,9 @@ class _FanucReader(ProgramReader):
             if m is None:
                 continue
             if m[2] or not names:
-                self.mark_not_corrected(line, "a position register")
+                self.mark_not_corrected(
+                    line, "a position register" if m[2] == "R" else "a position of a pallet"
+                )
                 continue
             for name, index in names:
                 if name is None:
@@ -146,7 +149,7 @@ class _FanucReader(ProgramReader):
             if re.match(r"\s*\d*\s*:\s*(!|//|--eg)", body):
                 continue
             if r := _REFUSED.search(body):
-                reason = f"'{r[0]}' changes a frame while the program runs"
+                reason = f"'{r[0]}' changes what points mean"
                 raise self.error(line, reason, "a program without it")
             yield line, re.sub(r"^\s*\d*\s*:\s*", "", body)
 

@@ -39,9 +39,11 @@ from hilcal.calibration.programs.program import (
     read_text,
     to_euler,
 )
+from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
 KINDS = ("TOOL", "BASE")
+POINTS = ("E6POS", "POS", "FRAME", "E6AXIS", "AXIS")  # types of points
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
 OVERHEAD, ELBOW = 1, 2  # bits of S
 _FIELD = re.compile(
@@ -56,7 +58,7 @@ _MOTION = re.compile(
     r"^\s*(S?PTP|S?LIN|S?CIRC|SPL|ASYPTP|S?(?:PTP|LIN|CIRC|SPL)_REL)\b(?!\s*=)", re.IGNORECASE
 )
 _NAME = re.compile(r"\$?[A-Za-z_]\w*(?:\s*\[\s*\d+\s*\])?")
-_PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{|$)", re.IGNORECASE)
+_PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{[^}}]*\}}(?!\s*:)|$)", re.IGNORECASE)
 """A target that is a name or an aggregate, at the beginning of a motion's arguments."""
 _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
 _LOAD = re.compile(r"^\s*\$LOAD\s*(\.\s*M\s*)?=\s*(.+)$", re.IGNORECASE)
@@ -77,12 +79,16 @@ _NO_CALLS = (
     *("CWRITE", "CREAD", "SREAD", "SWRITE", "ANOUT", "ANIN", "TRIGGER", "INTERRUPT"),
     *("EXT", "EXTFCT", "DEF", "DEFFCT", "GLOBAL", "DECL", "SIGNAL"),
 )
-_DEFINITION = re.compile(r"^[ \t]*(GLOBAL[ \t]+)?DEF(FCT)?\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
+_DEFINITION = re.compile(
+    r"^[ \t\ufeff]*(GLOBAL[ \t]+)?DEF(FCT)?\b[^\r\n]*", re.IGNORECASE | re.MULTILINE
+)
 _FORBIDDEN = re.compile(
     r"\$(ROBROOT|WORLD|NULLFRAME|ERSYSROOT|TOOL|BASE)\b\s*(\.\w+\s*)?=(?!=)"
     r"|\$IPO_MODE\s*=\s*#TCP|\$(CORRECTION|PRO_IP)\b",
     re.IGNORECASE,
 )
+_TURN_STAYS = re.compile(r"\$?\bORI_TYPE?\s*=?\s*#CONST\w*", re.IGNORECASE)
+"""Straight and circular motions then end with the orientation of the point before."""
 _OUTER_TOOL = re.compile(r"\$IPO_MODE\s*=\s*#TCP", re.IGNORECASE)
 _INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
 """Statements that read a point without a motion."""
@@ -146,9 +152,14 @@ class _Value:
 
     @classmethod
     def of(cls, code: str, offset: int, file: int, line: int, kind: str = "") -> "_Value":
-        """Return the aggregate at the beginning of a text, which is at `offset` in the file."""
-        body = code[: code.index("}") + 1] if "}" in code else code
-        matches = _FIELD.finditer(body)
+        """Return the aggregate at the beginning of a text, which is at `offset` in the file.
+
+        One that only begins an expression (`{…}:XP1`) is computed, and has no fields.
+        """
+        body, end, rest = code.partition("}")
+        if rest.lstrip().startswith(":"):  # the geometric operator: the product of two frames
+            body = ""
+        matches = _FIELD.finditer(body + end)
         fields = {m[1].upper(): (m[2], offset + m.start(2), offset + m.end(2)) for m in matches}
         return cls(file, line, kind.upper(), fields)
 
@@ -200,13 +211,16 @@ class _KrlReader(ProgramReader):
     def collect(self, text: str, file: int) -> None:
         """Collect all named aggregates of a file; `file` is −1 for that of --frames."""
         for line, offset, code in _code(text):
+            if file >= 0 and (m := _TURN_STAYS.search(code)):
+                reason = f"'{m[0]}' leaves the orientation of points aside"
+                raise InputError(f"{self.files[file]}: line {line}: {reason}; valid: #VAR")
             if m := _DATA.match(code):
                 value = _Value.of(m[3], offset + m.start(3), file, line, m[1] or "")
                 self.data.setdefault(_key(m[2]), []).append(value)
 
     def read(self, texts: Sequence[str], suffixes: Sequence[str]) -> Program:
         lines = list(_code(texts[0]))
-        self.used = self._used_otherwise(lines)
+        self.other_uses = self._used_otherwise(lines)
         self.changed = _changed(lines)
         blocks: list[list[_State]] = []  # states at the beginning and after branches of open blocks
         for k, (line, offset, code) in enumerate(lines):
@@ -309,7 +323,8 @@ class _KrlReader(ProgramReader):
             return np.eye(4)
         if value.startswith("{"):
             numbers = _Value.of(value, 0, 0, line).numbers(POSE)
-            return f"${kind} of line {line} is incomplete" if numbers is None else of_euler(numbers)
+            lack = f"${kind} of line {line} is incomplete or computed"
+            return lack if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         fixed = m is not None and m[2] == "0"  # the flange, or the world
         if not fixed and (changed := self._change_of(value)):
@@ -368,8 +383,6 @@ class _KrlReader(ProgramReader):
             elif len(values) != 1 or values[0].file < 0:
                 lack = "is not in this program" if not values else "has several values"
                 reason = reason or f"the point '{body[:40]}' {lack}"
-            elif key in self.used:
-                reason = reason or f"line {self.used[key]} uses or changes '{body[:40]}' otherwise"
             if len(values) == 1 and values[0].file >= 0:
                 value = values[0]
                 name = f"{body} ({self.files[value.file]} line {value.line})"
@@ -378,6 +391,8 @@ class _KrlReader(ProgramReader):
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
         axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
+        if not value.fields:
+            return bare.refused("the point is computed while the program runs")
         moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:
             return bare.refused(MOVES.format(moving[0]))
@@ -399,7 +414,7 @@ class _KrlReader(ProgramReader):
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         out: dict[str, int] = {}
         keys: dict[str, list[str]] = {}
-        for key in self.data:
+        for key in (k for k, v in self.data.items() if v[0].kind in POINTS and v[0].file >= 0):
             for name in {key, key.partition("[")[0]}:
                 keys.setdefault(name, []).append(key)
         for line, _, code in lines:

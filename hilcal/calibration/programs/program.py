@@ -359,9 +359,13 @@ class ProgramReader:
 
     def program(self, texts: Sequence[str] = (), suffixes: Sequence[str] = ()) -> Program:
         """Return the program with all recorded points."""
+        said = {p.line for p in self.points.values() if p.name == f"line {p.line}"}
         for name, line in self.other_uses.items():
-            if name in self.points and not self.points[name].not_corrected:
-                point = self.points[name]
+            point = self.points.get(name)
+            if point is None and line not in said:
+                why = f"it uses the point '{name[:40]}' otherwise than as the end of a known motion"
+                self.mark_not_corrected(line, why)
+            elif point is not None and not point.not_corrected:
                 self.points[name] = point.refused(f"line {line} uses or changes it otherwise")
         language, points = self.controller.language, tuple(self.points.values())
         if not points:

@@ -46,7 +46,10 @@ from hilcal.types import Floats, Ints
 POSE = 7  # numbers of a pose
 LEAST = 4  # least number of arguments of a motion: point, speed, zone, tool
 UNUSED = 8e8  # numbers of external axes above this mean no axis: 9E9
-_HEAD = re.compile(r"^[ \t]*(MODULE|(LOCAL[ \t]+)?PROC)\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
+_HEAD = re.compile(
+    r"^[ \t\ufeff]*(MODULE|(LOCAL[ \t]+)?PROC)\b[^\r\n]*", re.IGNORECASE | re.MULTILINE
+)
+_PARAMETERS = re.compile(r"\b(?:PROC|FUNC\s+\w+)\s+\w+\s*\(([^)]*)\)", re.IGNORECASE)
 _STATEMENT = re.compile(r"[^;]*;")
 _BLANK = re.compile(r'"[^"]*"|!.*')
 _DATA = re.compile(
@@ -151,7 +154,7 @@ class _RapidReader(ProgramReader):
             for m in _ASSIGNED.finditer(code)
             if not _NO_ASSIGNMENT.search(code[: m.start()])
         }
-        self.used, obeyed = self._used_otherwise(), True
+        self.other_uses, obeyed = self._used_otherwise(), True
         grips = any(_GRIP.search(code) for _, code in self.statements)
         self.gripped: float | None = None if grips else 0.0  # kg
         for offset, code in self.statements:
@@ -182,6 +185,9 @@ class _RapidReader(ProgramReader):
                     place = offset + m.start() + (d.start(4) if d[4] is not None else 0)
                     out.setdefault(d[2].upper(), []).append((d[1].lower(), value, place))
                     break
+            for m in _PARAMETERS.finditer(code):  # hide what the module has of the same name
+                for d in re.finditer(r"\b(\w+)\s+(\w+)\s*(?=[,|\\{]|$)", m[1]):
+                    out.setdefault(d[2].upper(), []).append((d[1].lower(), "", offset + m.start()))
         return out
 
     def _targets(self, code: str, m: re.Match[str]) -> tuple[list[tuple[int, str]], str, str]:
@@ -266,8 +272,6 @@ class _RapidReader(ProgramReader):
             elif len(values) != 1 or not values[0][1]:
                 reason = "has several values" if values else "is not in this module"
                 new = new.refused(f"the point '{text[:40]}' {reason}")
-            elif key in self.used:
-                new = new.refused(f"line {self.used[key]} uses or changes '{text[:40]}' otherwise")
             else:
                 kind, value, place = values[0]
                 name = f"{text} (line {line_of(self.text, place)})"
@@ -333,7 +337,8 @@ class _RapidReader(ProgramReader):
 
     def _used_otherwise(self) -> dict[str, int]:
         out: dict[str, int] = {}
-        points = {k for k, v in self.data.items() if v[0][0] in ("robtarget", "jointtarget")}
+        kinds = ("robtarget", "jointtarget")
+        points = {k for k, v in self.data.items() if any(x[0] in kinds and x[1] for x in v)}
         for offset, code in self.statements:
             skipped = [
                 d.span(1) for d in re.finditer(r"\b(?:robtarget|jointtarget)\s+(\w+)", code, re.I)

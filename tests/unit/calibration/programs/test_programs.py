@@ -191,6 +191,18 @@ def test_without_a_correction_every_byte_stays(maker, ends, arms, tmp_path):
         assert content == (tmp_path / f"weld{suffix}").read_bytes()
 
 
+@pytest.mark.parametrize(("maker", "head"), [("krl", "DEF weld"), ("rapid", "MODULE Weld")])
+def test_a_program_that_begins_with_a_byte_order_mark_is_not_corrected_twice(
+    maker, head, arms, tmp_path
+):
+    copied(maker, tmp_path, lambda text: text[text.index(head) :].replace("PROC", "TRAP"))
+    path = tmp_path / EXAMPLE[maker].file
+    path.write_text(f"\ufeff{path.read_text('latin-1')}", encoding="utf-8", newline="")
+    found = read(maker, arms, tmp_path)
+    path.write_bytes(found.corrected(found.q + DELTA)[path.suffix])
+    refusal(r"line 1: it is corrected already", read, maker, arms, tmp_path)
+
+
 @pytest.mark.parametrize("maker", EXAMPLE)
 def test_a_corrected_program_means_the_corrected_joint_values(maker, arms, examples, tmp_path):
     """By its own reading, and one pose by other eyes: a pattern, SciPy and Pinocchio."""
@@ -288,7 +300,7 @@ def test_what_is_not_understood_is_refused_by_line(case, given, arms, tmp_path):
     [
         ("krl", "gripper_open( )", "PTP_REL {A1 5}", ["line 31"]),
         ("krl", "LIN XP2 C_DIS", "LIN XP2:XP3 C_DIS", ["line 28", "XP3 (weld.dat line 12)"]),
-        ("rapid", "Offs(p30,0,0,40)", "Offs(p30,0,0,z)", ["line 19", "line 20"]),
+        ("rapid", "Offs(p30,0,0,40)", "Offs(p30,0,0,z)", ["line 19", "p30 (line 8)"]),
         ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", ["P[2] (line 25)"]),
         ("fanuc", "X =    -2.992", "X =  9000.000", ["P[1] (line 19)"]),  # out of reach
     ],
