@@ -195,7 +195,7 @@ def test_without_a_correction_every_byte_stays(maker, ends, arms, tmp_path):
 def test_a_program_that_begins_with_a_byte_order_mark_is_not_corrected_twice(
     maker, head, arms, tmp_path
 ):
-    copied(maker, tmp_path, lambda text: text[text.index(head) :].replace("PROC", "TRAP"))
+    copied(maker, tmp_path, lambda t: t[max(t.find(head), 0) :].replace("PROC", "TRAP"))
     path = tmp_path / EXAMPLE[maker].file
     path.write_text(f"\ufeff{path.read_text('latin-1')}", encoding="utf-8", newline="")
     found = read(maker, arms, tmp_path)
