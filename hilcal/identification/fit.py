@@ -10,7 +10,7 @@ import numpy as np
 from hilcal import limits, numbers
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError, expect
-from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts
+from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts, of_another_arm
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
 from hilcal.identification.outliers.data_snooping import DataSnooping, Disagreement, SnoopingResult
@@ -409,7 +409,8 @@ def fit(
     """Fit a model to readings.
 
     `start` and `prior` of a previous fit reproduce it in few steps. The drift of a carried prior is
-    estimated from the readings, unless `prior` is given.
+    estimated from the readings, unless `prior` is given; where they contradict it, and are likelier
+    of another arm of the type, the fit has it as such.
 
     Gross errors are set aside: they stay in the file and are listed, but are not fitted. They are
     sought unless `outlier` (N,) says which readings they are; whether the others disagree is tested
@@ -420,6 +421,31 @@ def fit(
         InputError: a deflection without its unloaded reading, or too many readings.
     """
     limits.check_fitted(len(readings), readings.m)
+    found = _fit(model, readings, mode, scaling, start, prior, outlier)
+    carried = found.model.prior
+    if carried is None or prior is not None or carried.relation != "arm" or scaling != "gc":
+        return found
+    if not found.contradictions:
+        return found
+    another = replace(model, prior=carried.of_another_arm(model.catalogue))
+    other = _fit(another, readings, mode, scaling, found.theta, None, found.outlier)
+    same = found.model, found.solution
+    if not of_another_arm(same, (other.model, other.solution), found.whitening):
+        return found
+    if not found.outlier.any():
+        return other
+    return _fit(another, readings, mode, scaling, other.theta, None, outlier)
+
+
+def _fit(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    scaling: Scaling,
+    start: Floats | None,
+    prior: Floats | None,
+    outlier: Bools | None,
+) -> Fit:
     if model.prior is not None and prior is None:
         model = replace(model, prior=model.prior.with_drift(None))
     used, disagreement, (w, solution) = _set_aside(model, readings, mode, start, prior, outlier)

@@ -436,6 +436,8 @@ def prior_lines(fit: Fit) -> list[str]:
     name = source.campaign or "a posterior"
     name += f", revision {source.revision}" if source.revision else ""
     lines = [f"Prior: {name} ({source.n_readings} readings{arm})."]
+    if prior.by_readings:
+        lines.append("  The readings say so, at over 20 : 1: as this arm's, too many parts moved.")
     moved = fit.contradictions
     for c in moved[:MOST_CONFLICTS]:
         g, effect = c.group, c.group.effect.replace("_", " ")

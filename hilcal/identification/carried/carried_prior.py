@@ -76,6 +76,7 @@ class CarriedPrior:
     least: Mapping[str, float] = field(default_factory=dict)  # drift of each effect, in units of S
     expected: Mapping[str, float] = field(default_factory=dict)  # the drift to be expected
     drift: Floats | None = None  # (1 + G,) δ_0, and δ of each of `groups`, as a fit has chosen them
+    by_readings: bool = False  # whether the readings say that it is of another arm, see `drift`
 
     @cached_property
     def groups(self) -> tuple[DriftGroup, ...]:
@@ -110,9 +111,15 @@ class CarriedPrior:
         """Return the prior with other drifts (1 + G,)."""
         return replace(self, drift=drift)
 
+    def of_another_arm(self, catalogue: Catalogue) -> "CarriedPrior":
+        """Return the prior as that of another arm of the type; stated drifts stay."""
+        stated = {name: value for name, value in self.least.items() if value > 0}
+        other = carried_prior(self.posterior, "type", stated, catalogue)
+        return replace(other, by_readings=True)
+
     def to_json(self) -> dict[str, object]:
         """Return the prior as JSON, the posterior included."""
-        rest = ("relation", "least", "expected", "drift")
+        rest = ("relation", "least", "expected", "drift", "by_readings")
         return {
             "posterior": self.posterior.to_json(),
             **{k: encode(getattr(self, k)) for k in rest},
@@ -127,6 +134,7 @@ class CarriedPrior:
             dict(content["least"]),
             dict(content["expected"]),
             decode(Floats | None, content["drift"]),
+            bool(content.get("by_readings", False)),  # files before 1.1 have none
         )
 
 

@@ -24,6 +24,9 @@ with the whole prior, and with the effect held at zero while the others keep the
 distribution. Readings that do not depend on the effect are no evidence against it. Directions of
 the prior without information have a standard deviation of one ordinary magnitude.
 
+Many parts that have moved may be another arm. Then every part differs by what arms of one type do,
+which a drift of a few parts imitates at the measured poses alone (`of_another_arm`).
+
 Sources: Patterson and Thompson, Biometrika 58 (1971) 545-554; Polson and Scott, Bayesian Analysis 7
 (2012) 887-902 (half-Cauchy priors of variances).
 """
@@ -53,6 +56,9 @@ TOLERANCE = 0.1  # change of the degrees of freedom v tr P K of a group that end
 NEGLIGIBLE = 1e-6  # variance in units of S² that counts as none
 LARGE_DIMENSION = 1e6  # dimension at which a ratio of quadratic forms is one of them
 LEAST_P = 1e-300
+ODDS = 20.0  # odds at which a prior counts as another arm's; a choice
+
+_Fitted = tuple[Model, Solution]  # a model with a carried prior, and its fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +119,7 @@ def _columns(
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
     """Return δ (1 + G,) at a fit: the doubt of its carried prior, and the drift of its groups."""
     prior, rows = _linear(model, solution, w)
-    scale2 = np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
+    scale2 = _drift_scale2(prior)
     forms = [g @ g.T for g in rows.drift]
 
     def moments(p: Floats, residual: Floats) -> tuple[Floats, Floats]:
@@ -201,6 +207,48 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     return prior, _Linear(inside, flat, random, turned, noise_rows, square)
 
 
+def of_another_arm(same: _Fitted, other: _Fitted, w: Whitening) -> bool:
+    """Whether readings say at `ODDS` that a prior is of another arm, and not of the same one.
+
+    `same` and `other` are fits to the same readings by either relation, with the drift chosen. They
+    are compared by ℓ and the half-Cauchy prior of their drift, at the larger noise of both.
+    """
+    beta = max(1.0, same[1].beta, other[1].beta)
+    gain = _log_posterior(*other, w, beta) - _log_posterior(*same, w, beta)
+    return gain > float(np.log(ODDS))
+
+
+def _log_posterior(model: Model, solution: Solution, w: Whitening, beta: float) -> float:
+    """ℓ at the drift of a fit, with its prior relative to that of no more than the least drift."""
+    prior, rows = _linear(model, solution, w)
+    assert model.prior is not None  # noqa: S101 - see `_linear`
+    used = prior.least_drift if model.prior.drift is None else model.prior.drift
+    v, total = used**2 - prior.least_drift**2, rows.random @ rows.random.T
+    total += beta * np.eye(len(total))
+    for moved in np.flatnonzero(v > NEGLIGIBLE):
+        total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
+    noise = rows.noise_rows * np.log(beta) + rows.square / beta
+    of_drift = np.log1p(np.maximum(v, 0.0) / _drift_scale2(prior)).sum()
+    return _log_likelihood(total, rows.flat, rows.y) - float(noise / 2 + of_drift)
+
+
+def _drift_scale2(prior: CarriedPrior) -> Floats:
+    """(1 + G,) squared scales of the half-Cauchy priors of δ."""
+    return np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
+
+
+def _log_likelihood(covariance: Floats, flat: Floats, y: Floats) -> float:
+    """ℓ of y (Q,) with columns F (Q, F) and V (Q, Q), without constants."""
+    low = np.linalg.cholesky(covariance)
+    white = sl.solve_triangular(low, np.column_stack([flat, y]), lower=True, check_finite=False)
+    f, r = white[:, :-1], white[:, -1]
+    values, vectors = np.linalg.eigh(f.T @ f)
+    determined = values > 1e-12 * values.max(initial=0.0)
+    along = (f @ vectors[:, determined]).T @ r / np.sqrt(values[determined])
+    log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[determined]).sum())
+    return -0.5 * (log_det + float(r @ r) - float(along @ along))
+
+
 def carried_effects(model: Model) -> tuple[str, ...]:
     """Effects that a model has because its carried prior has them."""
     if model.prior is None:
@@ -225,15 +273,8 @@ def evidence_of_carried(
         space = coordinates_of(reduced)
         used = a[:, place[space.index]]
         x = np.hstack([random, used @ space.matrix])
-        low = np.linalg.cholesky(x @ x.T + solution.beta * np.eye(len(x)))
-        columns = np.column_stack([flat, y - used @ space.mean])
-        white = sl.solve_triangular(low, columns, lower=True, check_finite=False)
-        f, r = white[:, :-1], white[:, -1]
-        values, vectors = np.linalg.eigh(f.T @ f)
-        determined = values > 1e-12 * values.max(initial=0.0)
-        along = (f @ vectors[:, determined]).T @ r / np.sqrt(values[determined])
-        log_det = 2 * float(np.log(np.diag(low)).sum()) + float(np.log(values[determined]).sum())
-        return -0.5 * (log_det + float(r @ r) - float(along @ along))
+        total = x @ x.T + solution.beta * np.eye(len(x))
+        return _log_likelihood(total, flat, y - used @ space.mean)
 
     parameters = np.arange(model.size)
     with_all, evidence = likelihood(model, parameters), {}

@@ -234,6 +234,7 @@ def test_the_joint_that_moved_is_found_and_let_go():
     assert (worst.group.effect, worst.group.joint) == ("joint_compliance", 3)
     assert worst.moved_sigma > 6
     assert worst.drift > 0.1
+    assert found.model.prior.relation == "arm"  # one part has moved
     others = [c.p_value for c in found.conflicts[1:]]
     assert min(others) > 1e-3 / len(others)
     truth = 1.5 * both().world.physics.joint_compliance[2]
@@ -275,6 +276,20 @@ def test_another_arm_of_the_type_may_differ_by_more():
     assert (other >= same * 0.999).all()
     assert other.sum() > 1.05 * same.sum()
     assert carried_prior(p, stated={"encoder_offset": 0.7}).least["encoder_offset"] == 0.7
+
+
+@pytest.mark.slow
+def test_a_prior_that_is_of_another_arm_is_taken_as_such():
+    """Drifts of a few parts would imitate the other arm at the measured poses alone."""
+    known, rng = Posterior.of(fitted("joint_compliance", "link_geometry")), np.random.default_rng(4)
+    other, p = of_links(), plan(10, 79)
+    softer = other.world.physics.joint_compliance * rng.uniform(0.6, 1.6, 6)
+    physics = other.world.physics.with_effect("joint_compliance", softer)
+    physics = physics.with_effect("link_geometry", 5e-4 * rng.standard_normal((7, 6)))
+    few = measured(replace(other.world, physics=physics), p, rng)
+    found = fit(baseline(other.cell, few, "absolute", prior=carried_prior(known)), few, "absolute")
+    assert (found.model.prior.relation, found.model.prior.by_readings) == ("type", True)
+    assert "The readings say so" in "".join(prior_lines(found))
 
 
 def test_priors_that_cannot_be_are_refused():
