@@ -391,6 +391,11 @@ def fit_and_test_lines(judged: validation.Judged, test: validation.Validation) -
             f"{sharing}; they are left out."
         )
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
+    if judged.turns_aside:
+        yield (
+            "Orientations are left aside: the model was fitted to positions, and target_rotvec_rad "
+            "of [tool] does not state how the target is turned.\n"
+        )
 
 
 def validation_report(
@@ -412,7 +417,7 @@ def validation_report(
     yield out
     yield note(
         "stated: standard deviation that the fit states for these readings, with extrapolation; "
-        "z: ratio of error to stated.\n"
+        f"z: ratio of error to stated{', orientations included' * (test.readings.m > 3)}.\n"
     )
     if not (count := int(beyond.outside.sum())):
         yield "All of them lie inside the measured range.\n"
@@ -425,6 +430,8 @@ def validation_report(
         yield more if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield _as_far_off(z_all)
+        if test.readings.m > 3:
+            yield f"Their positions alone are {_rms(beyond.z_position):.2g} times as far off.\n"
     if test.registered:
         yield "The place of the tracker was fitted to these readings (--register).\n"
     if step := next_of(test, beyond):

@@ -342,6 +342,16 @@ class Readings(Tabular):
             return self
         return replace(self, covariance=self.stated, common=None, stated=None, arm_scatter=None)
 
+    def positions_alone(self) -> "Readings":
+        """Return the readings without orientations."""
+        return replace(
+            self,
+            value=self.value[:, :3],
+            covariance=self.covariance[:, :3, :3],
+            common=None if self.common is None else self.common[:, :3],
+            stated=None if self.stated is None else self.stated[:, :3, :3],
+        )
+
     def with_serial(self, noise: SerialNoise | None) -> "Readings":
         """Return all readings of a campaign with noise that is correlated along their order."""
         if noise is None:

@@ -24,6 +24,7 @@ import scipy
 from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
 from hilcal.cell import Cell
+from hilcal.config import CellConfig
 from hilcal.diagnosis.change import changing, find_changes
 from hilcal.diagnosis.comparison import Comparison, error_today, with_missing_effects
 from hilcal.effects.catalogue import Catalogue
@@ -102,6 +103,7 @@ def compare(
         )
     number, fit = run.fit_in_use(say, revision)
     chosen, shared = _fresh(run, later, fit, number)
+    chosen = _comparable(chosen, fit.readings, run.config)
     nominal_rms = _nominal_rms(later, chosen)
     old, new = run.cell, later.cell
     if same_setup is None:
@@ -250,6 +252,9 @@ def validate(
             f"{run.path}; a limit is tested with readings that were not"
         )
     chosen = readings[fresh] if mixed else readings
+    comparable = _comparable(chosen, fitted, run.config)
+    judged = replace(judged, turns_aside=comparable.m < chosen.m)
+    chosen = comparable
     say(f"predicting {len(chosen)} readings")
     knows, tool = run.predictive(record, model, theta), _tool_differs(run, other)
     if not all((*run.cell.known_targets, *other.cell.known_targets)):
@@ -273,6 +278,18 @@ def different_serial_numbers(first: Campaign, second: Campaign) -> tuple[str, st
         return None
     one, two = (RunLog(c.file).serial_number() for c in (first, second))
     return (one, two) if one and two and one != two else None
+
+
+def _comparable(readings: Readings, fitted: Readings, config: CellConfig) -> Readings:
+    """Return readings without orientations where nothing says how the target is turned.
+
+    A model that was fitted to positions takes it as turned like the flange unless [tool] states it.
+    """
+    tool = config.tool
+    turns = [t.target_rotvec_rad for t in tool.targets or [tool]]
+    if fitted.m == readings.m or fitted.m > 3 or None not in turns:
+        return readings
+    return readings.positions_alone()
 
 
 def _tool_differs(first: Campaign, second: Campaign) -> tuple[str, ...]:

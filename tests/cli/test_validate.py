@@ -2,15 +2,18 @@
 
 import csv
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
+from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import PLAN, SERIAL_NUMBER
 from hilcal.tables.table import write_table
+from tests.support.campaigns import campaign as simulated
 from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, run
 from tests.support.foreign_tables import MOUNT, OFFSET, campaign, lines, write
 
@@ -132,6 +135,32 @@ def test_another_reflector_is_predicted_where_the_other_cell_has_it(tmp_path, ca
     assert d["tool_differs"] == ["target_m"]
     assert d["error"]["rms_m"] < 2 * d["noise_floor_m"] + 1e-4
     assert "[tool] target_m of b.hilcal differ; those of b.hilcal" in ok(capsys, *arguments).out
+
+
+def test_a_model_of_positions_is_not_judged_by_how_the_target_is_turned(tmp_path, capsys):
+    """Nothing tells it; the place of the tracker that --register fits does not depend on it."""
+    r = simulated("none", "absolute", 6, poses=20, m=6).readings
+    first, turned = r.pose < 10, r.value.copy()
+    quarter = se3.rotation(np.array([0.0, 0.0, np.pi / 2]))
+    turned[:, 3:] = se3.rotation_vector(se3.rotation(turned[:, 3:]) @ quarter)
+    tables = (
+        ("fit", r.positions_alone()[first]),
+        ("poses", replace(r, value=turned)[~first]),
+        ("positions", r.positions_alone()[~first]),
+    )
+    for name, readings in tables:
+        write_table(readings, tmp_path / f"{name}.csv", INSTRUMENT_AND_ARM)
+        path = tmp_path / f"{name}.hilcal"
+        ok(capsys, "import", tmp_path / f"{name}.csv", "--config", CELL, "-o", path)
+    fit = tmp_path / "fit.hilcal"
+    ok(capsys, "identify", fit, "--readings", "absolute")
+    poses, positions = (
+        ok(capsys, "validate", fit, tmp_path / f"{name}.hilcal", "--register", "--json")
+        for name in ("poses", "positions")
+    )
+    assert poses.document["error"] == positions.document["error"]
+    shown = ok(capsys, "validate", fit, tmp_path / "poses.hilcal", "--register").out
+    assert "Orientations are left aside" in shown
 
 
 def test_a_gross_error_of_one_reading_is_not_taken_for_a_moved_tracker(folder, tables, capsys):

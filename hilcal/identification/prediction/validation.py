@@ -201,6 +201,7 @@ class Extrapolation:
     variables: tuple[ExceededRange, ...]  # those that are exceeded, most measurements first
     stated_m: Floats  # (D,) stated standard deviation of the 3-D position error, m
     z: Floats  # (D,) error over the stated standard deviation, rms of the elements
+    z_position: Floats  # (D,) the same of the position alone
     inside_error: ErrorBlock | None  # of the measurements inside; None where there are none
     outside_error: ErrorBlock | None  # of those outside
 
@@ -265,7 +266,11 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
         beyond.append(ExceededRange(POSITION_STD, "m", 0.0, limit, int(far.sum()), most))
     outside |= far
     total = spread + noise
-    square, read = _squares(total, raw)
+
+    def ratio(m: int) -> Floats:
+        """Error over stated standard deviation (D,) of the first m elements."""
+        square, read = _squares(total[:, :m, :m], raw[:, :m])
+        return np.asarray(np.sqrt(square / np.maximum(read, 1)))
 
     def error(rows: Bools) -> ErrorBlock | None:
         """Errors of some measurements, each whitened by itself."""
@@ -278,7 +283,8 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
         outside=outside,
         variables=tuple(sorted(beyond, key=lambda v: -v.count)),
         stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
-        z=np.sqrt(square / np.maximum(read, 1)),
+        z=ratio(w.m),
+        z_position=ratio(3),
         inside_error=error(~outside),
         outside_error=error(outside),
     )
@@ -302,6 +308,7 @@ class Judged:
     sharing_unloaded: int  # further ones whose unloaded reading was fitted
     unseen: bool  # whether those that are judged were never fitted; False where all were
     scalar: bool = False  # whether some readings are one number, a distance or a height
+    turns_aside: bool = False  # whether orientations are left aside, of which the model has none
 
     @property
     def model(self) -> str:
