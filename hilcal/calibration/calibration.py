@@ -98,6 +98,8 @@ class Calibration(Brief):
     covariance_source: CovarianceSource | None = None  # None where `root` is stated
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     """Means that replace columns of `States` that points lack, by column."""
+    turn_std: float = 0.0
+    """rad, about each axis: how far the flange may be turned beside the target, see `_turn_std`."""
     refuted_by: tuple[int, int] | None = None
     """Points within their 95 % band, of all points of a test that refutes the bands, see
     `improvement.refuted`; None: not refuted, or not tested."""
@@ -140,6 +142,7 @@ class Calibration(Brief):
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
             covariance_source=covariance_source,
+            turn_std=_turn_std(fit),
         )
         return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
@@ -373,6 +376,12 @@ class Calibration(Brief):
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
             isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in unstated)
             covariance = turn @ (by_parameters + scatter) @ turn.T + isotropic * np.eye(3)
+            offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes
+            lever = se3.apply(se3.product(rotation, tool.nominal[:3, :3].T), offset)
+            across = np.sum(lever**2, axis=1)[:, None, None] * np.eye(3)
+            covariance = covariance + self.turn_std**2 * (
+                across - lever[:, :, None] * lever[:, None, :]
+            )
             std_m = np.sqrt(np.trace(by_parameters, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, std_m, self.turns))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
@@ -400,6 +409,28 @@ class Calibration(Brief):
         jacobian = derivative(tool.model, prediction, tool.theta, 3, self.mode)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
         return np.asarray(jacobian @ self.covariance_root[tool.columns])
+
+
+def _turn_std(fit: Fit) -> float:
+    """Return the standard deviation, rad, of the flange's turn that attitudes do not tell.
+
+    One target's turn on the flange is estimated from its attitudes by the nominal arm, and held; so
+    a turn of the last link is known by its prior alone, and has the size of it.
+    """
+    model = fit.model
+    if fit.mode != "absolute" or fit.readings.m == 3 or model.cell.targets is not None:
+        return 0.0
+    if any(e.role == "target" for e in model.effects):  # then its turn is estimated with the others
+        return 0.0
+    last, prior = f"link{model.cell.arm.n}.", fit.solution.prior
+    sizes = [
+        e.magnitudes[k] if np.isinf(prior[part][k]) else prior[part][k]
+        for e, part in zip(model.effects, model.slices(), strict=True)
+        for k, p in enumerate(e.parameters)
+        if e.change is not None and e.change.kind == "link" and p.name.startswith(last)
+        if p.unit == "rad"
+    ]
+    return float(np.sqrt(np.mean(np.square(sizes)))) if sizes else 0.0
 
 
 def _unloaded(states: States) -> States:

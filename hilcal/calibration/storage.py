@@ -74,6 +74,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "loads": c.loads,
         "force_sensor": c.sensor,
         "refuted_by": c.refuted_by,
+        "turn_std_rad": c.turn_std,
     }
     return {key: encode(value) for key, value in content.items()}
 
@@ -125,6 +126,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         source=dict(content["source"]),
         sensor=decode(SensorMount | None, content.get("force_sensor")),
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
+        turn_std=float(content.get("turn_std_rad", 0.0)),
         refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),
     )
     _check(calibration, cell.arm.n)

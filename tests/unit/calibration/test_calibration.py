@@ -25,6 +25,7 @@ from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import campaign, cell_of, plan
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 POSES = 24
@@ -274,6 +275,27 @@ def test_the_band_holds_its_share():
         c = (root.T @ root)[None]
         drawn = np.linalg.norm(rng.standard_normal((20000, 3)) @ root, axis=1)
         assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
+
+
+def test_attitudes_do_not_tell_how_the_flange_is_turned_beside_the_target():
+    """The turn of one target on the flange is estimated, so that another tool is less certain."""
+    c = campaign("link_geometry", "absolute", 2, poses=20, strength=20.0, m=6)
+    names = ("joint_compliance", "link_geometry")
+    model = fitted_model(c.cell, c.readings, "absolute", names)
+    calibration, states = Calibration.of(model), plan(15, 500).states
+    base = calibration.base_in_tracker()
+
+    def inside(k, tool):
+        true = (c.world.registration @ c.world.equilibrium(states).flange @ tool)[:, :3, 3]
+        p = k.predict(states.q, states.wrench, tool=tool)
+        errors = np.linalg.norm((true - base[:3, 3]) @ base[:3, :3] - p.position, axis=1)
+        return float(np.mean(errors <= band(p.covariance)))
+
+    other = se3.matrix(np.eye(3), np.array([0.0, 0.05, 0.3]))
+    assert inside(calibration, c.cell.target) > 0.9
+    assert inside(calibration, other) > 0.9
+    assert inside(replace(calibration, turn_std=0.0), other) < 0.1
+    assert from_json(to_json(calibration)).turn_std == calibration.turn_std
 
 
 def test_coupled_joints_are_compensated_by_the_controllers_values():
