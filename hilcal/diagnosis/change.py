@@ -205,10 +205,12 @@ class ShiftedReading:
     pose: str
     load: str
     off_m: float  # by how much, m
+    off_rad: float | None = None  # its orientation, rad; None where only positions were read
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
-        return {"pose": self.pose, "load": self.load, "off_m": self.off_m}
+        turn = {} if self.off_rad is None else {"off_rad": self.off_rad}
+        return {"pose": self.pose, "load": self.load, "off_m": self.off_m, **turn}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -402,9 +404,12 @@ def _off_by_itself(minimum: LaterFit, least: float) -> tuple[int, ShiftedReading
         score = score_family(s, x.T @ residual, *_pooled(minimum))
         if score.p_value * len(w) < LEVEL and score.log_evidence > best:
             r, row = later.readings, int(w.reading[k])
-            shift = GROSS_SCALE * float(np.linalg.norm(score.step[:3]))
+            shift, turn = (
+                GROSS_SCALE * float(np.linalg.norm(s)) for s in (score.step[:3], score.step[3:])
+            )
+            off_rad = turn if w.m > 3 else None
             pose, load = r.pose_names[r.pose[row]], r.load_names[r.load[row]]
-            best, off = score.log_evidence, (row, ShiftedReading(pose, load, shift))
+            best, off = score.log_evidence, (row, ShiftedReading(pose, load, shift, off_rad))
     return off
 
 

@@ -50,7 +50,11 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
         model = "the baseline" if c.number is None else f"revision {c.number}"
         yield f"{c.shared} of its {c.readings} readings were fitted by {model}; they are left out."
     if gross := c.changes.gross:
-        listed = [f"{g.pose}/{g.load} (off by {numbers.length(g.off_m)})" for g in gross]
+        turns = ("" if g.off_rad is None else f" and {1e3 * g.off_rad:.3g} mrad" for g in gross)
+        listed = [
+            f"{g.pose}/{g.load} (off by {numbers.length(g.off_m)}{turn})"
+            for g, turn in zip(gross, turns, strict=True)
+        ]
         yield f"Set aside as gross errors: {numbers.few(listed, MOST_LISTED)}; measure them again."
     if c.later_mode not in (None, c.mode):
         kinds = {"deflection": "deflections", "absolute": "absolute readings"}

@@ -8,13 +8,15 @@ import pytest
 import hilcal as hc
 from hilcal.diagnosis.change import candidates, find_changes
 from hilcal.drivers.simulated.injected_effects import world_without_effect
-from hilcal.drivers.simulated.rehearsal import measurement_noise
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import place_tracker
 from hilcal.effects.protocol import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.carried.later_readings import earlier_fit, later_readings
+from hilcal.robot import se3
 from studies.change import measured, remeasured, studied_arm
+from studies.random_campaigns import rehearsal_states
 from tests.support.campaigns import configuration
 from tests.support.refusals import refusal_of
 from tests.support.rows import first
@@ -38,6 +40,17 @@ def later(arm, change, seed, *, anew=True, count=15, off=None):
     if off is not None:
         readings.value[off, :3] += [4e-3, 0.0, -3e-3]
     return find_changes(later_readings(arm.earlier, readings, anew=anew))
+
+
+def test_a_gross_error_of_an_orientation_is_stated_as_one(arm):
+    rng = np.random.default_rng(2)
+    states, *numbers = rehearsal_states(arm.cell, 15, [], rng)
+    readings = simulate(arm.world, states, *numbers, ("none",), rng, 6)
+    turned = se3.rotation(np.array([0.0, 0.05, 0.0])) @ se3.rotation(readings.value[6, 3:])
+    readings.value[6, 3:] = se3.rotation_vector(turned)
+    (gross,) = find_changes(later_readings(arm.earlier, readings, anew=False)).gross
+    assert (gross.pose, gross.off_rad) == ("p7", pytest.approx(0.05, rel=0.05))
+    assert gross.off_m < 1e-3
 
 
 def zero(joint, size):
