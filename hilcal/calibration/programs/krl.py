@@ -247,6 +247,9 @@ class _KrlReader(ProgramReader):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
                 self._statement(line, offset, code)
+        for key in [k for k in self.other_uses if k not in self.points]:
+            if self.data[key][0].kind == "FRAME":  # rather a base than a point
+                del self.other_uses[key]
         return self.program(texts, suffixes)
 
     def _forget(self, because: str) -> None:

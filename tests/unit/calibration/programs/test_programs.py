@@ -376,6 +376,15 @@ def test_points_of_a_frame_that_the_program_changes_are_left(
     assert all(p.not_corrected.endswith(f"changes {changed}") for p in found)
 
 
+def test_a_frame_of_the_program_is_a_base_and_no_point(arms, tmp_path):
+    numbers = "{X 800,Y -200,Z 150,A 30,B 0,C 0}"
+    lines = f"DECL INT i\r\nDECL FRAME table={numbers}"
+    copied(
+        "krl", tmp_path, lambda t: t.replace("DECL INT i", lines).replace("BASE_DATA[2]", "table")
+    )
+    assert not any(p.not_corrected for p in read("krl", arms, tmp_path).program.points)
+
+
 def test_a_form_that_is_written_into_the_program_replaces_the_one_before(arms, tmp_path):
     form = "FDAT_ACT={TOOL_NO 1,BASE_NO 3,IPO_FRAME #BASE}"
     copied("krl", tmp_path, lambda t: t.replace("FDAT_ACT=FP2", form))
