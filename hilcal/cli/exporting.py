@@ -13,7 +13,7 @@ import tomli_w
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.handover import CorrectedArm, corrected_arm
-from hilcal.calibration.robot_files.correct import KINDS, correct_file
+from hilcal.calibration.robot_files.descriptions import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import check_new, command
 from hilcal.cli.terminal import Terminal

@@ -17,7 +17,7 @@ import hilcal as hc
 from hilcal.calibration.handover import CorrectedArm, urdf
 from hilcal.calibration.points import read_points
 from hilcal.calibration.programs.languages import read_program
-from hilcal.calibration.robot_files.correct import correct_file
+from hilcal.calibration.robot_files.descriptions import correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document

@@ -11,7 +11,7 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import corrected_arm, frames, ur_kinematics, urdf
-from hilcal.calibration.robot_files.correct import correct_file
+from hilcal.calibration.robot_files.descriptions import correct_file
 from hilcal.identification.fit_document import frames_to_json
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm

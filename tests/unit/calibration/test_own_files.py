@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.handover import CorrectedArm, matlab
-from hilcal.calibration.robot_files.correct import correct_file
+from hilcal.calibration.robot_files.descriptions import correct_file
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions

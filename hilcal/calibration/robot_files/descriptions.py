@@ -1,4 +1,4 @@
-"""A user's URDF, xacro or SDF: links and the joints that lead to them, corrected in place.
+"""A user's robot description, corrected in place: URDF, xacro, SDF, MJCF, UR's calibration.conf.
 
 URDF: `<origin xyz rpy>` of the joints. In a xacro, only numbers are changed. An expression `${…}`
 of numbers and `pi` is evaluated, but refused by its line if it would have to change.
@@ -7,6 +7,11 @@ SDF (Gazebo): `<pose>` of joints and links. A pose is relative to the frame that
 names; without it, that of a link is relative to the model, that of a joint to its child link. Every
 link and joint whose pose in its own reference frame changes is edited. Source: *SDFormat
 Specification* 1.7 and later, "Pose frame semantics".
+
+MJCF (MuJoCo): `pos` and `quat` of the bodies that its joints move. Orientations may be `quat`,
+`axisangle`, `euler`, `xyaxes` or `zaxis`, with the angle settings of `<compiler>`; a changed
+orientation is written as `quat`. Axes come from the joint, else from its class in `<default>`.
+Source: MuJoCo, *XML Reference*: body, joint, site, compiler, frame orientations, default settings.
 """
 
 import ast
@@ -15,24 +20,33 @@ import operator
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from hilcal.calibration.handover import origin_of
-from hilcal.calibration.programs.program import Span
+from hilcal import limits
+from hilcal.calibration.dh_table import dh_rows
+from hilcal.calibration.handover import CorrectedArm, origin_of
+from hilcal.calibration.programs.program import Span, edited
 from hilcal.calibration.robot_files.chain_text import (
     EDIT_TOLERANCE,
+    FRAME_TOLERANCE,
     ChainStep,
     Document,
     Edits,
     Node,
+    edits_of,
+    fitted_chain,
     numbers,
     pose_difference,
+    read_xml,
     z_to,
 )
 from hilcal.errors import InputError
 from hilcal.names import escaped
+from hilcal.numbers import length
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
 TURNING = ("revolute", "continuous")  # types of a joint that turns
@@ -343,3 +357,219 @@ def _sdf_step(model: SdfModel, joint: Node) -> ChainStep:
     elif kind != "fixed":
         raise model.document.error(joint, not_between(name, kind))
     return ChainStep(name, joint.line, place, turn, lambda _: [])
+
+
+_TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+
+
+def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainStep]:
+    """Return the steps from a base body to a tip, a body or a site."""
+    world = document.root.child("worldbody")
+    if world is None:
+        raise InputError(f"{document.name}: no <worldbody>; valid: an MJCF with the arm in it")
+    for node in document.root.descendants("include", "attach", "replicate"):
+        raise document.error(node, f"<{node.tag}>; valid: the arm in the file itself")
+    hinged = [b for b in world.descendants("body") if b.child("joint") is not None]
+    if not hinged:
+        raise InputError(f"{document.name}: no body with a joint; valid: an MJCF with the arm")
+    if tip is None:
+        ends = [b for b in hinged if not any(o is not b and b in _up(o) for o in hinged)]
+        if len(ends) != 1:
+            names = ", ".join(_name(b) for b in ends)
+            raise InputError(f"{document.name}: give --tip-link; its last bodies: {names}")
+        (end,) = ends
+    else:
+        end = _named(document, world, tip, ("body", "site"))
+    start = hinged[0].parent if base is None else _named(document, world, base, ("body",))
+    above = _up(end)
+    if start is None or start not in above:
+        raise InputError(f"{document.name}: no chain from '{base}' to '{tip}'")
+    return [_step(document, b) for b in reversed(above[: above.index(start)])]
+
+
+def _up(node: Node) -> list[Node]:
+    out = [node]
+    while out[-1].parent is not None:
+        out.append(out[-1].parent)
+    return out
+
+
+def _name(node: Node) -> str:
+    return escaped(node.attributes.get("name", f"<{node.tag}> of line {node.line}"))
+
+
+def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) -> Node:
+    nodes = [n for n in world.descendants(*tags) if n.attributes.get("name") == name]
+    if len(nodes) != 1:
+        valid = ", ".join(_name(n) for n in world.descendants(*tags) if "name" in n.attributes)
+        raise InputError(
+            f"{document.name}: no {' or '.join(tags)} '{escaped(name)}'; valid: {valid}"
+        )
+    return nodes[0]
+
+
+def _step(document: Document, node: Node) -> ChainStep:
+    joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
+    if node.tag == "frame" or len(joints) > 1:
+        reason = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
+        raise document.error(node, reason)
+    pos = document.numbers(node, node.attributes.get("pos", "0 0 0"), 3)
+    place = se3.matrix(_rotation(document, node), pos)
+    turn = None
+    if joints:
+        (joint,) = joints
+        kind = _default(document, joint, "type") or "hinge"
+        if joint.tag != "joint" or kind != "hinge":
+            reason = f"joint '{_name(joint)}' is no hinge; valid: hinges between base and tip"
+            raise document.error(joint, reason)
+        axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
+        origin = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
+        turn = se3.matrix(np.eye(3), origin) @ z_to(document.direction(joint, axis))
+
+    def write(new: Floats) -> Edits:
+        out: Edits = []
+        if np.abs(new[:3, 3] - pos).max() > 1e-12:
+            out.append(document.attribute_edit(node, "pos", numbers(new[:3, 3])))
+        turned = se3.rotation_vector(new[:3, :3] @ place[:3, :3].T)
+        if np.linalg.norm(turned) > 1e-12:
+            value = numbers(se3.quaternion(new[:3, :3]))
+            key = next((k for k in _TURNS if k in node.attributes), "quat")
+            old = document.attribute_span(node, key)
+            if key == "quat" or old is None:
+                return [*out, document.attribute_edit(node, "quat", value)]
+            head = document.text.rfind(key, node.start, old.start)
+            between = document.text[head + len(key) : old.start]
+            out.append((Span(0, head, old.end), f"quat{between}{value}"))
+        return out
+
+    return ChainStep(_name(node), node.line, place, turn, write)
+
+
+def _rotation(document: Document, node: Node) -> Floats:
+    keys = [k for k in _TURNS if k in node.attributes]
+    if not keys:
+        return np.eye(3)
+    key = keys[0]
+    v = document.numbers(node, node.attributes[key], _TURNS[key])
+    compiler = {
+        k: v for c in document.root.descendants("compiler") for k, v in c.attributes.items()
+    }
+    unit = 1.0 if compiler.get("angle") == "radian" else np.pi / 180
+    if key == "quat":
+        return se3.of_quaternion(document.direction(node, v))
+    if key == "axisangle":
+        return se3.rotation(unit * v[3] * document.direction(node, v[:3]))
+    if key == "zaxis":
+        return z_to(document.direction(node, v))[:3, :3]
+    if key == "xyaxes":
+        x = document.direction(node, v[:3])
+        y = document.direction(node, v[3:] - (x @ v[3:]) * x)
+        return np.stack([x, y, np.cross(x, y)], axis=1)
+    sequence = compiler.get("eulerseq", "xyz")
+    if not re.fullmatch(r"[xyzXYZ]{3}", sequence):
+        raise InputError(f"{document.name}: eulerseq '{escaped(sequence)}'; valid: such as xyz")
+    out = np.eye(3)
+    for letter, angle in zip(sequence, v, strict=True):
+        turn = se3.rotation(unit * angle * np.eye(3)["xyz".index(letter.lower())])
+        out = out @ turn if letter.islower() else turn @ out
+    return out
+
+
+def _default(document: Document, joint: Node, key: str) -> str | None:
+    """Attribute of a joint, else of its class, of its bodies' class, or of the main class."""
+    if key in joint.attributes:
+        return joint.attributes[key]
+    name = joint.attributes.get("class") or next(
+        (n.attributes["childclass"] for n in _up(joint) if "childclass" in n.attributes), None
+    )
+    classes = list(document.root.descendants("default"))
+    default = next(
+        (d for d in classes if d.attributes.get("class") == name),
+        next((d for d in classes if d.parent is document.root), None),
+    )
+    while default is not None and default.tag == "default":
+        joint_default = default.child("joint")
+        if joint_default is not None and key in joint_default.attributes:
+            return joint_default.attributes[key]
+        default = default.parent
+    return None
+
+
+KINDS = "a URDF, a xacro, an MJCF, an SDF, or UR's calibration.conf"
+_STEPS = {"mujoco": mjcf_steps, "robot": urdf_steps}
+_DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedFile:
+    """A corrected file."""
+
+    content: bytes
+    note: str  # changes, and what the file cannot represent, for people
+
+
+def correct_file(
+    path: Path,
+    nominal: Arm,
+    corrected: CorrectedArm,
+    base: str | None = None,
+    tip: str | None = None,
+) -> CorrectedFile:
+    """Return a file with the corrected geometry in place of its own."""
+    if path.suffix == ".conf":
+        return _ur_conf(path, nominal, corrected.arm)
+    document = read_xml(path)
+    kind = document.root.tag
+    if kind == "sdf":
+        chain = sdf_chain(document, base, tip)
+        new = fitted_chain(chain.steps, nominal, corrected.arm, document.name)
+        edits, names = chain.edits(list(new.transforms))
+    elif kind in _STEPS:
+        steps = _STEPS[kind](document, base, tip)
+        new = fitted_chain(steps, nominal, corrected.arm, document.name)
+        edits, names = edits_of(steps, new.transforms)
+    else:
+        raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
+    changed = f"{len(names)} place{'s' * (len(names) != 1)} changed ({', '.join(names)})"
+    note = f"{path}: {changed if names else 'no place changed'}, all else as it was"
+    if new.axis_distance > FRAME_TOLERANCE:
+        note += f"; its axes were up to {length(new.axis_distance)} from those of the nominal "
+        note += nominal.name
+    if (shift := pose_difference(new.unrepresented, np.eye(4))) > EDIT_TOLERANCE:
+        note += (
+            f"; its tip is the last moving link, which cannot represent the shift of the flange "
+            f"({length(shift)}): give --tip-link"
+        )
+    if pose_difference(new.tip, np.eye(4)) > FRAME_TOLERANCE:
+        note += (
+            f"; its tip is {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
+            f"{nominal.name}, and stays there"
+        )
+    return CorrectedFile(edited(document.text, edits).encode("latin-1"), note)
+
+
+def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
+    """Return UR's `calibration.conf`: differences between the arm's and nominal classic DH rows."""
+    text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
+    lines = {m[2]: m for m in _DELTA.finditer(text)}
+    if set(lines) != {"theta", "a", "d", "alpha"}:
+        raise InputError(
+            f"{path}: not the four lines delta_theta, delta_a, delta_d, delta_alpha; valid: UR's "
+            "calibration.conf"
+        )
+    if not nominal.name.startswith("ur"):
+        raise InputError(f"{path}: is for UR arms, the campaign has {nominal.name}")
+    old, new = dh_rows(nominal), dh_rows(arm)
+    values = {"a": new.a - old.a, "d": new.d - old.d}
+    for key, turn in (("theta", new.offset - old.offset), ("alpha", new.alpha - old.alpha)):
+        values[key] = (turn + np.pi) % (2 * np.pi) - np.pi
+    edits = [
+        (Span(0, m.start(3), m.end(3)), f" {', '.join(f'{v:.17g}' for v in values[key])}")
+        for key, m in lines.items()
+    ]
+    note = (
+        f"{path}: the four lines delta_… changed, all else as it was. The rows do not contain "
+        f"the pose of joint 1's axis in the base (up to {length(new.base_moves)}) and that of the "
+        f"flange on the last axis (up to {length(new.flange_moves)})"
+    )
+    return CorrectedFile(edited(text, edits).encode("latin-1"), note)
