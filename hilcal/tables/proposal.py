@@ -44,17 +44,8 @@ STD = {
 EXPANDED = {"u95", "u2", "expanded"}
 VARIANCE = {"var", "variance", "varianz"}
 ROTATION = {
-    "r",
-    "rot",
-    "rotation",
-    "orientation",
-    "ang",
-    "angle",
-    "euler",
-    "winkel",
-    "rotvec",
-    "rv",
-}
+    "r", "rot", "rotation", "orientation", "ang", "angle", "euler", "winkel", "rotvec", "rv",
+}  # fmt: skip
 FORCE = {"f", "force", "kraft", "fuerza"}
 MOMENT = {"m", "mom", "moment", "torque", "t", "drehmoment", "couple"}
 QUATERNION = {"q", "quat", "quaternion"}
@@ -116,16 +107,8 @@ ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "w
 """Joint names of Universal Robots arms under ROS, in order."""
 
 DIFFERENCE = {
-    "dev",
-    "deviation",
-    "delta",
-    "diff",
-    "difference",
-    "error",
-    "err",
-    "residual",
-    "abweichung",
-}
+    "dev", "deviation", "delta", "diff", "difference", "error", "err", "residual", "abweichung",
+}  # fmt: skip
 """Words of differences, which are no readings."""
 CHINESE = {
     "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",

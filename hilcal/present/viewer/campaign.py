@@ -23,7 +23,7 @@ from hilcal.present.story import (
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import LOOPBACK, log_static, send_states
+from hilcal.present.viewer.recording import LOOPBACK
 from hilcal.robot.scene import capsules
 from hilcal.types import Floats, Ints
 
@@ -125,15 +125,17 @@ def log_story(rec: rr.RecordingStream, story: Story) -> None:
 
 def log_static_entities(rec: rr.RecordingStream, story: Story) -> None:
     """Log the static entities: shapes of the arm, axes of the world, the guide."""
-    log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     parts = style.shapes(capsules(story.arm), style.rails(story.arm))
     style.log_shapes(rec, [*parts, *style.target_shapes(story.arm, story.targets)])
     if story.target is not None:
         names = [story.target_names[k] for k in np.unique(story.target)]
-        log_static(
-            rec, f"world/arm/body{story.arm.n + 1}/names", style.labels(story.targets, names)
+        rec.log(
+            f"world/arm/body{story.arm.n + 1}/names",
+            style.labels(story.targets, names),
+            static=True,
         )
-    log_static(rec, "words/guide", style.document(GUIDE))
+    rec.log("words/guide", style.document(GUIDE), static=True)
 
 
 def log_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -174,20 +176,20 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
         colors=style.LEVEL_COLORS[r.level[far]],
         radii=np.full(len(far), 0.012),
     )
-    send_states(rec, "world/residual/current", time, current)
+    rec.send_columns("world/residual/current", [time], current)
     bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
     ball = rr.Ellipsoids3D.columns(
         centers=place, half_sizes=half, quaternions=quaternions, colors=bright
     )
-    send_states(rec, "world/residual/ball", time, ball)
+    rec.send_columns("world/residual/ball", [time], ball)
     dots = [leader(p, h) for p, h in zip(place, half, strict=True)]
     strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
-    send_states(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
+    rec.send_columns("world/residual/leader", [time], strips.partition([len(x) for x in dots]))
     labels = [f"pose {story.pose_name(i)}: {_size(story, r, i)}" for i in far.tolist()]
-    send_states(
-        rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels)
+    rec.send_columns(
+        "world/residual/worst", [time], style.label_columns(place + _LABEL_ABOVE, labels)
     )
-    send_states(rec, "words/verdict", time, style.documents(pose_cards(story)))
+    rec.send_columns("words/verdict", [time], style.documents(pose_cards(story)))
     # the bar of the current pose; its entity's name, last in order, puts it in front
     for pose, left, width, height in zip(*_bar_places(story, r), strict=True):
         rec.set_time("pose", sequence=int(pose))

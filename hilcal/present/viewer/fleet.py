@@ -13,7 +13,6 @@ from hilcal import numbers
 from hilcal.present.comparison import FAR, type_report, unlike_words
 from hilcal.present.document import heading
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.revision import seconds_of
@@ -83,7 +82,7 @@ def arm_positions(d: DrawnType) -> Floats:
 
 def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Log the arms; joints unlike the type are red, those beyond `FAR` σ amber."""
-    log_static(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    rec.log(path, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     parts = [*capsules(d.arm), *style.rails(d.arm)]
     poses = body_poses(d.arm, np.resize(np.array(_STANDS), d.arm.n)[None])[0]
     body, radius = (np.array([getattr(s, k) for s in parts]) for k in ("body", "radius"))
@@ -95,8 +94,10 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     place, marked = arm_positions(d), np.asarray(d.odd.any(axis=1))
     low, high = (np.concatenate([x + p for p in place]) for x in (start, end))
     colors = np.concatenate([_colors(d, a)[body] for a in range(len(place))])
-    log_static(
-        rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(place)), colors)
+    rec.log(
+        f"{path}/arms",
+        style.drawn_capsules(low, high, np.tile(radius, len(place)), colors),
+        static=True,
     )
     named = np.flatnonzero(marked | (len(place) <= _NAMED))
     # Long labels are placed above the names of the neighbours, at different heights.
@@ -105,11 +106,11 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     feet = place[named] + top
     thin = rr.Radius.ui_points(1.0)
     leaders = rr.LineStrips3D(np.stack([feet, feet + above], 1), colors=[style.RED], radii=thin)
-    log_static(rec, f"{path}/names/leader", leaders)
+    rec.log(f"{path}/names/leader", leaders, static=True)
     arms = [d.pooled.arms[a] for a in named]
     unlike = [[unlike_words(o) for o in d.pooled.unlike if o.arm == arm] for arm in arms]
     texts = ["\n".join(lines[:3]) or arm for arm, lines in zip(arms, unlike, strict=True)]
-    log_static(rec, f"{path}/names", style.labels(feet + above, texts))
+    rec.log(f"{path}/names", style.labels(feet + above, texts), static=True)
     if marked.any():
         frames = rr.Boxes3D(
             centers=place[marked] + 0.5 * top,
@@ -118,7 +119,7 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
             radii=rr.Radius.ui_points(2.0),
             fill_mode="majorwireframe",
         )
-        log_static(rec, f"{path}/unlike", frames)
+        rec.log(f"{path}/unlike", frames, static=True)
 
 
 def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
@@ -146,9 +147,9 @@ def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
             odd = bool(d.odd[a, k])
             entity = f"{path}/{k}/{'zunlike' if odd else 'like'}/{a}"
             color, width = (style.RED, 3.0) if odd else (style.GREY, 1.2)
-            log_static(rec, entity, *style.series(arm, color, width, 2 * width))
+            rec.log(entity, *style.series(arm, color, width, 2 * width), static=True)
             time = rr.TimeColumn("date", timestamp=d.seconds[determined])
-            send_states(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[determined, k]))
+            rec.send_columns(entity, [time], rr.Scalars.columns(scalars=d.campaigns[determined, k]))
 
 
 def record_fleet(fleet: "Fleet", path: Path) -> None:
@@ -170,8 +171,8 @@ def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
         who = f"{numbers.names(odd)} {verb}" if odd else "No arm is"
         name, table, note, *lines = type_report(d.pooled)
         text = style.markdown([heading(f"{who} unlike the others"), name, *lines, table, note])
-        log_static(rec, f"words/type{i}", style.document(text))
-    log_static(rec, "words/guide", style.document(GUIDE))
+        rec.log(f"words/type{i}", style.document(text), static=True)
+    rec.log("words/guide", style.document(GUIDE), static=True)
     recording.flush(rec)
 
 

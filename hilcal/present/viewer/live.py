@@ -32,7 +32,6 @@ from hilcal.present.live_viewer import MeasuringStart
 from hilcal.present.progress import duration_text, met_words, reading_text, status_words
 from hilcal.present.story import LIMITS, Story, levels
 from hilcal.present.viewer import campaign, recording, style
-from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.scene import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
@@ -278,15 +277,15 @@ class LiveScene:
         self._series = f"live/{self._campaigns}"
         self._world = f"world/{self._series}"
         rec.send_recording_name(f"hilcal: {style.storable(start.name)}")
-        log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._arm = style.MovingArm(rec, f"{self._world}/arm", start.arm, start.targets)
-        log_static(rec, "words/live_guide", style.document(GUIDE))
+        rec.log("words/live_guide", style.document(GUIDE), static=True)
         planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
-        log_static(rec, f"{self._world}/planned", planned)
+        rec.log(f"{self._world}/planned", planned, static=True)
         for name, color in zip(style.LEVEL_NAMES, style.LEVEL_COLORS, strict=True):
-            log_static(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
+            rec.log(f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1], static=True)
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
-        log_static(rec, f"{self._series}/limit", line)
+        rec.log(f"{self._series}/limit", line, static=True)
         if start.earlier_steps:  # readings of earlier sessions, as one batch
             walls, steps = zip(*start.earlier_steps, strict=True)
             dots = rr.Points3D.columns(
@@ -294,8 +293,8 @@ class LiveScene:
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
                 radii=np.full(len(steps), 0.01),
             )
-            send_states(
-                rec, f"{self._world}/dots", rr.TimeColumn(TIMELINE, timestamp=list(walls)), dots
+            rec.send_columns(
+                f"{self._world}/dots", [rr.TimeColumn(TIMELINE, timestamp=list(walls))], dots
             )
         self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()

@@ -23,7 +23,6 @@ from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
 from hilcal.present.progress import duration_text
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot import chain as chains
 from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.plan import UNLOADED, Plan
@@ -169,7 +168,7 @@ class PlanView:
 
 
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
-    log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     of_arm, parts = len(capsules(d.cell.arm)), d.shapes.scene.parts
     dark = [*parts[of_arm:], *style.rails(d.cell.arm)]
     style.log_shapes(rec, style.shapes(parts[:of_arm], dark))
@@ -178,11 +177,13 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     _beads(rec, d)
     if d.tracker is not None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        log_static(
-            rec, "world/tracker", style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
+        rec.log(
+            "world/tracker",
+            style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER]),
+            static=True,
         )
         above = d.tracker + 2.2 * _HEAD * _UP
-        log_static(rec, "world/tracker/name", style.labels([above], ["tracker"]))
+        rec.log("world/tracker/name", style.labels([above], ["tracker"]), static=True)
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
@@ -191,7 +192,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
         for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
             look: dict[str, Any] = {"colors": [(*_OBSTACLE, alpha)], "fill_mode": mode}
             drawn = rr.Boxes3D(centers=centers, sizes=sizes, **look)
-            log_static(rec, f"world/obstacles/box/{part}", drawn)
+            rec.log(f"world/obstacles/box/{part}", drawn, static=True)
     if stood := [x for x in things if x.bottom_m is not None]:
         height = np.array([x.height_m for x in stood], dtype=float)
         cylinders = rr.Cylinders3D(
@@ -201,10 +202,10 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
             colors=[(*_OBSTACLE, _SOLID)],
             fill_mode="solid",
         )
-        log_static(rec, "world/obstacles/cylinder", cylinders)
+        rec.log("world/obstacles/cylinder", cylinders, static=True)
     if things:
         names = style.labels([_named_at(x) for x in things], [x.name for x in things])
-        log_static(rec, "world/obstacles/names", names)
+        rec.log("world/obstacles/names", names, static=True)
 
 
 def _named_at(thing: Obstacle) -> Floats:
@@ -232,7 +233,7 @@ def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
             sides.append(corners)
     if sides:
         lines = rr.LineStrips3D(sides, colors=[_BOX], radii=rr.Radius.ui_points(0.6))
-        log_static(rec, "world/workspace", lines)
+        rec.log("world/workspace", lines, static=True)
 
 
 def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -241,7 +242,7 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
     steps = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
     center = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
     beads = rr.Points3D(center, colors=d.colors[d.load[steps]], radii=BEAD * d.reach)
-    log_static(rec, "world/target/beads", beads)
+    rec.log("world/target/beads", beads, static=True)
     lost = d.unseen[steps]
     if lost.any():
         cages = rr.Ellipsoids3D(
@@ -251,7 +252,7 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
             fill_mode="majorwireframe",
             line_radii=rr.Radius.ui_points(0.5),
         )
-        log_static(rec, "world/target/unseen", cages)
+        rec.log("world/target/unseen", cages, static=True)
 
 
 def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -262,11 +263,11 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     def lines(path: str, strips: Any, colors: Any, radius: float) -> None:
         radii = np.full(len(d), radius * d.reach)
         drawn = rr.LineStrips3D.columns(strips=strips, colors=colors, radii=radii)
-        send_states(rec, path, d.steps, drawn)
+        rec.send_columns(path, [d.steps], drawn)
 
     radii = np.full(len(d), 1.7 * BEAD * d.reach)
     points = rr.Points3D.columns(positions=d.target, colors=colors, radii=radii)
-    send_states(rec, "world/target/now", d.steps, points)
+    rec.send_columns("world/target/now", [d.steps], points)
     above = d.target + (_LABEL_ABOVE + d.rank.max(initial=0) * BEAD_GAP * d.reach) * _UP
     texts = [
         f"{k + 1}: {s.pose}, {load_name(s.load)}"
@@ -274,7 +275,7 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         for k, s in enumerate(d.plan.steps)
     ]
     labels = style.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, texts)
-    send_states(rec, "world/label", d.steps, labels)
+    rec.send_columns("world/label", [d.steps], labels)
     lines("world/label/leader", np.stack([d.target, above], 1), beams, 0.0012)
     if d.tracker is not None:
         start = np.broadcast_to(d.tracker, d.target.shape)
@@ -343,12 +344,12 @@ def _log(rec: rr.RecordingStream, d: PlanView) -> None:
     times = pairs(row for row in plan_blocks.cost_rows(d.summary) if row[0] in NOT_FIRST)
     details = style.markdown([times, *tables])
     for name, text in (("plan", overview(d)), ("guide", GUIDE), ("details", details)):
-        log_static(rec, f"words/{name}", style.document(text))
+        rec.log(f"words/{name}", style.document(text), static=True)
     recording.flush(rec)
     _step_scene(rec, d)
     _schedule(rec, d)
-    send_states(
-        rec, "words/step", d.steps, style.documents([step_card(d, k) for k in range(len(d))])
+    rec.send_columns(
+        "words/step", [d.steps], style.documents([step_card(d, k) for k in range(len(d))])
     )
     recording.flush(rec)
 
@@ -408,10 +409,10 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
     for entity, name, members, color, marker, size in series:
         named = f"{style.storable(name)}: {int(members.sum())}"
         look: dict[str, Any] = {"colors": [color], "markers": [marker], "marker_sizes": [size]}
-        log_static(rec, f"schedule/{entity}", rr.SeriesPoints(names=[named], **look))
+        rec.log(f"schedule/{entity}", rr.SeriesPoints(names=[named], **look), static=True)
         time = rr.TimeColumn("step", sequence=np.flatnonzero(members) + 1)
-        send_states(
-            rec, f"schedule/{entity}", time, rr.Scalars.columns(scalars=d.time[members] / 60.0)
+        rec.send_columns(
+            f"schedule/{entity}", [time], rr.Scalars.columns(scalars=d.time[members] / 60.0)
         )
 
 

@@ -58,18 +58,6 @@ def is_timeout(error: Exception) -> bool:
     return "timeout" in str(error).lower() or "timed out" in str(error).lower()
 
 
-def log_static(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
-    """Log a static entity."""
-    rec.log(path, *drawn, static=True)
-
-
-def send_states(
-    rec: rr.RecordingStream, path: str, time: rr.TimeColumn, columns: rr.ComponentColumnList
-) -> None:
-    """Send the states of an entity at several times."""
-    rec.send_columns(path, indexes=[time], columns=columns)
-
-
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, log: Callable[[], None], path: Path
 ) -> None:

@@ -14,7 +14,6 @@ from hilcal.config import Obstacle
 from hilcal.measuring.clearance import contains
 from hilcal.present import story
 from hilcal.present.document import Block, Chart, Items, Table, Words, description_of
-from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import Capsule, capsules
 from hilcal.types import Bools, Floats
@@ -194,7 +193,7 @@ class MovingArm:
         self._start, self._end, radius, colors = _arrays(parts)
         lengths, _ = _along(self._end - self._start)
         look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
-        log_static(rec, path, rr.Capsules3D.from_fields(lengths=lengths, **look))
+        rec.log(path, rr.Capsules3D.from_fields(lengths=lengths, **look), static=True)
 
     def send(self, timeline: str, walls: list[float], bodies: Floats) -> None:
         """Send the poses of the bodies (K, n + 2, 4, 4) at K times of day, s."""
@@ -205,14 +204,14 @@ class MovingArm:
         placed = rr.Capsules3D.columns(
             translations=start.reshape(-1, 3), quaternions=quaternions
         ).partition([len(self._body)] * len(walls))
-        send_states(self._rec, self._path, rr.TimeColumn(timeline, timestamp=walls), placed)
+        self._rec.send_columns(self._path, [rr.TimeColumn(timeline, timestamp=walls)], placed)
 
 
 def log_shapes(rec: rr.RecordingStream, parts: Shapes) -> None:
     """Log the shapes of every body at `world/arm/bodyI`."""
     for i in sorted({p.body for p, _ in parts}):
         of_body = _arrays([shape for shape in parts if shape[0].body == i])
-        log_static(rec, f"world/arm/body{i}", drawn_capsules(*of_body))
+        rec.log(f"world/arm/body{i}", drawn_capsules(*of_body), static=True)
 
 
 def quaternions_of(rotation: Floats) -> Floats:
@@ -233,7 +232,7 @@ def send_poses(rec: rr.RecordingStream, time: rr.TimeColumn, bodies: Floats) -> 
     for i in range(1, bodies.shape[1]):
         shift, turn = bodies[:, i, :3, 3], quaternions_of(bodies[:, i, :3, :3])
         placed = rr.Transform3D.columns(translation=shift, quaternion=turn)
-        send_states(rec, f"world/arm/body{i}", time, placed)
+        rec.send_columns(f"world/arm/body{i}", [time], placed)
 
 
 def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points3D:
