@@ -114,8 +114,8 @@ def calibrate(
     flags = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
     flags += [] if options.prior is None else ["--prior", str(options.prior)]
     flags += [word for path in effects_from or () for word in ("--effects-from", str(path))]
-    go_on = _Continuation(t, shlex.join([*line, "--resume", *flags]), shlex.join([*line, *flags]))
-    p = _procedure(cell, output, resume, rehearse, robot_cell, catalogue, settings, go_on)
+    start, go_on = (shlex.join([*line, *more, *flags]) for more in ([], ["--resume"]))
+    p = _procedure(t, cell, output, resume, rehearse, robot_cell, catalogue, settings, go_on)
     prior = p.settings.prior
     if prior is not None:
         if options.prior is None and Path(prior).parent != output.absolute().parent:
@@ -137,7 +137,7 @@ def calibrate(
             RunLog(campaign).skip(skip)
     if not (rehearse or output.exists()):
         drivers_of(config)  # refuses a cell without them before anything is planned
-    with go_on.explained(p), ExitStack() as stack:
+    with _explained(p, start, go_on), ExitStack() as stack:
         live = stack.enter_context(live_viewer(t, view, output))
         CalibrationOperator(t, p, stack, rehearse, yes, live).run_steps()
         with working(t.progress) as say:
@@ -163,35 +163,30 @@ def calibrate(
     t.document({**_document(p), "improvement": improvement.to_dict(), "limit_m": limit_m}, failed)
 
 
-@dataclass(frozen=True, slots=True)
-class _Continuation:
-    t: Terminal
-    resume: str
-    start: str
+@contextmanager
+def _explained(p: Procedure, start: str, go_on: str) -> Iterator[None]:
+    """Add to errors what is stored, and the command that starts again or goes on."""
 
-    @contextmanager
-    def explained(self, p: Procedure) -> Iterator[None]:
-        """Add to errors what is stored, and the command that resumes."""
+    def safe() -> str:
+        if not p.run.exists():
+            return f"{p.run} does not exist; start again with: {start}"
+        return f"everything measured so far is safe; go on with: {go_on}"
 
-        def safe() -> str:
-            if not p.run.exists():
-                return f"{p.run} does not exist; start again with: {self.start}"
-            return f"everything measured so far is safe; go on with: {self.resume}"
-
-        try:
-            yield
-        except KeyboardInterrupt:
-            raise StoppedError(f"interrupted: nothing moves; {safe()}") from None
-        except (InputError, LimitError):
-            raise
-        except HilcalError as error:
-            message = str(error).removesuffix(HOW_ON).rstrip(". ")
-            moved = isinstance(error, MovedFileError)
-            advice = f"then go on with: {self.resume}" if moved else safe()
-            raise type(error)(f"{message}; {advice}") from error
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise StoppedError(f"interrupted: nothing moves; {safe()}") from None
+    except (InputError, LimitError):
+        raise
+    except HilcalError as error:
+        message = str(error).removesuffix(HOW_ON).rstrip(". ")
+        moved = isinstance(error, MovedFileError)
+        advice = f"then go on with: {go_on}" if moved else safe()
+        raise type(error)(f"{message}; {advice}") from error
 
 
 def _procedure(
+    t: Terminal,
     path: Path,
     output: Path,
     resume: bool,
@@ -199,7 +194,7 @@ def _procedure(
     cell: Cell,
     catalogue: Catalogue,
     stated: dict[str, Any],
-    go_on: _Continuation,
+    go_on: str,
 ) -> Procedure:
     config = cell.configured()
     hide = (config.simulation.hide or NO_EFFECT) if rehearse else None
@@ -210,7 +205,7 @@ def _procedure(
         may_write(output, False)
         check_effects(cell, catalogue)
         if resume:
-            go_on.t.notice(f"{output} does not exist yet: the calibration starts")
+            t.notice(f"{output} does not exist yet: the calibration starts")
         _refuse_goal(config.readings_mode, stated, path)
         max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
@@ -224,15 +219,15 @@ def _procedure(
         raise InputError(f"{output}: its calibration is {kind}")
     if not resume:
         message = f"{output}: holds a calibration already, {words.state_clause(p.next())}"
-        raise InputError(f"{message}; go on with: {go_on.resume}")
+        raise InputError(f"{message}; go on with: {go_on}")
     _refuse_goal(p.settings.readings, stated, path)
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
         for text in changed_since_begun(campaign, p.config):
-            go_on.t.notice(f"note: {text}")
-    go_on.t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
+            t.notice(f"note: {text}")
+    t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
 
 
