@@ -69,7 +69,12 @@ def test_a_range_of_more_than_a_turn_has_every_angle():
 
 def test_a_joint_a_little_warmer_is_no_extrapolation():
     warmth = Range("joint 1 temperature", "K", 293.0, 294.0)
-    assert warmth.beyond(np.array([291.9, 292.1, 294.9, 295.1])).tolist() == [True, False, False, True]
+    assert warmth.beyond(np.array([291.9, 292.1, 294.9, 295.1])).tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]
 
 
 NAMES = ("R1", "R2", "R3")
