@@ -1,13 +1,9 @@
 """Drivers of force sensors against simulated ones: readings, and what goes wrong on the line."""
 
-import binascii
 import os
 import signal
-import struct
 import threading
 import time
-import tty
-from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -254,62 +250,6 @@ def test_the_wrong_sensor_is_told(instruments):
         lambda: bota.open_force_sensor(cases.config("bota", port, baud=1_000_000)),
         "no whole frame .* or it is no Bota sensor",
     )
-
-
-def bota_frame(number, wrench):
-    """A frame with the standard library's CRC, which is the mirror image of X-25's."""
-    body = struct.pack("<H6fIf", 0, *wrench, number * 1000 % 2**32, 30.0)
-    mirror = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
-    crc = binascii.crc_hqx(body.translate(mirror), 0xFFFF)
-    return b"\xaa" + body + struct.pack("<H", int(f"{crc:016b}"[::-1], 2) ^ 0xFFFF)
-
-
-@contextmanager
-def talker(tmp_path, frame):
-    """A line on which frame(k) comes every millisecond, for ever."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)
-    path = tmp_path / "line"
-    path.symlink_to(os.ttyname(slave))
-    stop = threading.Event()
-
-    def talk():
-        start, number = time.monotonic(), 0
-        while not stop.wait(0.002):
-            while number < (time.monotonic() - start) * 1000:
-                with suppress(BlockingIOError):
-                    os.write(master, frame(number))
-                number += 1
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
-        yield path
-    finally:
-        stop.set()
-        thread.join()
-        path.unlink()
-        os.close(master)
-        os.close(slave)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
-def test_values_that_cannot_be_never_pass(tmp_path, bad):
-    good = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
-    wrong = (1.0, 2.0, bad, 0.1, 0.2, 0.3)
-    with (
-        talker(tmp_path, lambda k: bota_frame(k, good if k % 10 else wrong)) as path,
-        cases.opened("bota", path) as sensor,
-    ):
-        sample = cases.steady(sensor, 0.2)
-        assert sample.wrench == pytest.approx(good)
-        assert sensor.losses().corrupt > 0
-    with talker(tmp_path, lambda k: bota_frame(k, wrong)) as path:
-        cases.fails(
-            lambda: cases.OPEN["bota"](cases.config("bota", path)),
-            "their values or their clock were impossible",
-        )
 
 
 def test_ft300_serves_a_modbus_library_that_no_driver_uses():

@@ -22,6 +22,7 @@ from tests.support.readings_cases import make_arm
 from tests.support.refusals import refusal
 
 ARM = make_arm()
+per_example_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 Q = [f"A{k}" for k in range(1, 7)]
 
@@ -169,9 +170,7 @@ def mapped(path, mapping, **options):
     return import_mapped(path, check_section(mapping, Mapping, "m.toml"), ARM, NOISE, **options)
 
 
-@settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@per_example_file
 @given(w=written())
 def test_round_trip(tmp_path, w):
     path = tmp_path / "t.txt"
@@ -244,9 +243,7 @@ def test_angles_that_the_encoders_reported(tmp_path):
     assert propose(path).proposal.mapping(Mapping) == check_section(mapping, Mapping, "m.toml")
 
 
-@settings(
-    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@per_example_file
 @given(w=written())
 def test_the_dialect_is_seen(tmp_path, w):
     """However a table is written, the preview reads the same numbers from it."""

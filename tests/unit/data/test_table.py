@@ -24,9 +24,7 @@ from tests.support.refusals import refusal, refusals, refuses
 ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 
-per_example_file = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+per_example_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def good():

@@ -197,11 +197,11 @@ def test_a_campaign_that_goes_on_shows_from_the_start_what_is_stored():
 
 def test_drift_of_the_reference_pose_is_told(b):
     def shift(*_):
-        if len(b.store.rows) == 6:
+        if len(b.store.rows) == 4:
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
     call_before(b.store, "record", shift)
-    b.measure(usual_plan())
+    b.measure()
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [True, True]
     said = b.remarks("reference pose has moved")
@@ -286,16 +286,6 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     assert b.remarks("asked to hang 3kg")
 
 
-@pytest.mark.long
-def test_three_wrong_loads_end_the_run(b):
-    b.world.wrong_loads = ["none", "6kg", "none", "6kg"]
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure, usual_plan())
-    assert len(b.store.rows) == 5
-    assert b.world.calls[-2] == "arm.stop"
-    b.world.restart()
-    assert len(b.measure(usual_plan())) == len(usual_plan().steps)
-
-
 def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong_loads = ["none", "3kg", "3kg"]
     b.measure()
@@ -341,15 +331,15 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
 
 
 def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
-    plan = usual_plan()
+    plan = FEW_POSES
     day = [1000.0]
 
     def wall():
         return day[0] + b.world.time
 
-    b.interrupt(7, plan, wall=wall)
+    b.interrupt(4, plan, wall=wall)
     done = len(b.store.rows)
-    assert 5 < done < len(plan.steps)
+    assert 3 < done < len(plan.steps)
     day[0] += 7200.0  # two hours later
     loads = len(b.operator.requests)
     readings = b.measure(plan, wall=wall)

@@ -18,6 +18,7 @@ from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog, create_run
 from tests.support.fake_bench import (
+    FEW_POSES,
     REGISTRATION,
     SAG,
     STD,
@@ -89,8 +90,7 @@ def bench():
     return b, tracker
 
 
-def measure(b, path):
-    plan = usual_plan()
+def measure(b, path, plan=FEW_POSES):
     made = CampaignFile.open(path) if path.exists() else create_run(path, b.config, Path(), plan)
     with made as file:
         run(b.rig, b.cell, plan, RunLog(file), b.clock, b.notes)
@@ -107,7 +107,7 @@ def by_key(r):
 def test_each_target_is_read_at_each_stop(tmp_path):
     b, _ = bench()
     r = measure(b, tmp_path / "r.hilcal")
-    plan = usual_plan()
+    plan = FEW_POSES
     stops = len(plan.steps)
     assert r.target.tolist() == [0] * BOOTSTRAP + [0, 1, 2] * (stops - BOOTSTRAP)
     assert len(np.unique(r.arrivals)) == stops
@@ -143,7 +143,7 @@ def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path):
     b, tracker = bench()
     angle = float(usual_plan().joints("p4")[0])
     tracker.hidden = {(angle, 1)}
-    r = measure(b, tmp_path / "some.hilcal")
+    r = measure(b, tmp_path / "some.hilcal", usual_plan())
     steps = usual_plan().steps[BOOTSTRAP:]
     wanted = {(s.pose, s.load, s.cycle, n) for s in steps for n in NAMES}
     lost = {key for key in wanted if key[0] == "p4" and key[3] == "R2"}
@@ -156,7 +156,7 @@ def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path):
     b, tracker = bench()
     tracker.hidden = {(angle, k) for k in range(3)}
     with pytest.raises(DeviceError, match=r"p4: .*all others.* run again with --resume"):
-        measure(b, tmp_path / "none.hilcal")
+        measure(b, tmp_path / "none.hilcal", usual_plan())
 
 
 def test_a_neighbour_is_not_taken_for_a_target(tmp_path):
@@ -183,7 +183,7 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
 
     call_before(b.rig.force, "average", leans)
     change_result(b.rig.force, "average", lets_go)
-    r = measure(b, tmp_path / "r.hilcal")
+    r = measure(b, tmp_path / "r.hilcal", usual_plan())
     assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
     with CampaignFile.open(tmp_path / "r.hilcal") as file:
         doubted = [e for e in RunLog(file).events() if e["kind"] == "doubted"]
@@ -206,7 +206,7 @@ def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path, name, count):
         assert stored.target.tolist()[BOOTSTRAP:] == [0, 1, 2] * (len(done) - BOOTSTRAP)
     b.world.restart()
     r = measure(b, tmp_path / "r.hilcal")
-    assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
+    assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(FEW_POSES.steps) - BOOTSTRAP)
 
 
 def test_what_cannot_be_pointed_is_refused(tmp_path):

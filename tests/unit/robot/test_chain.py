@@ -59,24 +59,6 @@ def test_flange_is_where_pinocchio_has_it(name, size):
         flange_at(chain, i, flange.homogeneous)
 
 
-@pytest.mark.parametrize("name", ["ur10e", ODD])
-def test_every_frame_is_its_matrix_product(name):
-    arm = arm_of(name)
-    q, d = angles(arm), random_deviation(arm, 0.02)
-    chain = evaluate(arm, q, d)
-    for i in range(COUNT):
-        links = arm.links @ np.array([displacement(t) for t in d.twist[i]])
-        pose = links[0]
-        for k in range(arm.n + 1):
-            here = se3.matrix(chain.rotation[k, i], chain.position[k, i])
-            np.testing.assert_allclose(here, pose, rtol=0, atol=TOLERANCE)
-            if k < arm.n:
-                pose = pose @ displacement([0, 0, 0, 0, 0, q[i, k] + d.dq[i, k]])
-                com = pose[:3, :3] @ arm.coms[k] + pose[:3, 3]
-                np.testing.assert_allclose(chain.com[k, i], com, rtol=0, atol=TOLERANCE)
-                pose = pose @ links[k + 1]
-
-
 def motion_by(arm, q, d, change, offset):
     """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
     r0 = evaluate(arm, q, d).rotation[-1]

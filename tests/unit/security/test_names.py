@@ -88,7 +88,6 @@ PIECES = (
 )  # fmt: skip
 names = st.lists(st.sampled_from((*PIECES, *PIECES, *EVIL)), min_size=1, max_size=7).map("".join)
 FORMULA = tuple("=+-@\t\r\uff1d\uff0b\uff0d\uff20")
-few = settings(max_examples=40, deadline=None)
 
 
 def harmless(text):
@@ -118,7 +117,6 @@ def test_documents_are_checked_however_deep_they_are():
     refusal("holds the character", check_names, {"a": {"b\u2028": 1}}, "f")
 
 
-@few
 @given(names, names)
 def test_urscript(name, other):
     text = movej_program([name, other], np.zeros((2, 6)))
@@ -144,7 +142,6 @@ def the_same_cells(text, wanted):
                     assert not begun.strip(' "').startswith(FORMULA)
 
 
-@few
 @given(names)
 def test_csv(name):
     folder = FOLDER[0]
@@ -170,7 +167,6 @@ def test_csv(name):
     assert pq.read_table(folder / "a.parquet")["pose"].to_pylist() == [escaped(name)]
 
 
-@few
 @given(names)
 def test_xml_and_yaml(name):
     arm = replace(ARM, name=name, joint_names=tuple(f"{name}{k}" for k in "abcdef"))
@@ -185,7 +181,6 @@ def test_xml_and_yaml(name):
     assert yaml.safe_load(made) == yaml.safe_load(ur_kinematics(ARM, ARM)[0])
 
 
-@few
 @given(names)
 def test_toml(name):
     arm = replace(ARM, source=name, joint_names=(name,) * 6)
@@ -207,7 +202,6 @@ def test_toml(name):
     assert tomllib.loads(cell) == tomllib.loads(cell_text({"robot": {"model": "ur10e"}}, "a"))
 
 
-@few
 @given(names)
 def test_command_lines(name):
     line = f"hilcal refine {quoted(name)} --prior a"
@@ -215,7 +209,6 @@ def test_command_lines(name):
     assert shlex.split(line) == ["hilcal", "refine", escaped(name), "--prior", "a"]
 
 
-@few
 @given(names)
 def test_json(name):
     text = Plan((name,), np.zeros((1, 6)), (Step(name, name),), {"by": name}).to_json()
@@ -283,7 +276,6 @@ def test_html(name):
     assert "".join(once.words) == escaped(name)
 
 
-@few
 @given(names)
 def test_rerun(name):
     assert harmless(viewer_style.storable(name))
@@ -293,7 +285,6 @@ def test_rerun(name):
     assert not re.search(r"(?<!\\)(?:\\\\)*[<>`*_\[\]]", words)
 
 
-@few
 @given(names)
 def test_python(name):
     form = FORM[0]
@@ -310,7 +301,6 @@ def test_an_effect_has_a_name_of_python(name):
     refusal("valid: lower-case letters", source_of_form, FORM[0], name)
 
 
-@few
 @given(names)
 def test_terminal(name):
     for terminal_ in (False, True):
@@ -373,7 +363,6 @@ def as_csv(header, *rows):
     return out.getvalue().encode("utf-8", "replace")
 
 
-@few
 @given(names)
 def test_tables_and_plans_refuse_a_name_or_keep_it(name):
     folder, q = FOLDER[0], [f"q{k}_rad" for k in range(1, 7)]
@@ -393,7 +382,6 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name):
     refused_or(lambda: read_plan(text, "plan.json").pose_names[0].strip(), name, "plan")
 
 
-@few
 @given(names)
 def test_exchange_tables_are_read_back_or_refused(name):
     readings = simple_readings(4)
@@ -408,7 +396,6 @@ def test_exchange_tables_are_read_back_or_refused(name):
             assert name in read_table(path, make_arm(), None).pose_names
 
 
-@few
 @given(names)
 def test_cells_and_documents_refuse_a_name_or_keep_it(name):
     if re.search("[\ud800-\udfff]", name):
