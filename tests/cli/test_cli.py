@@ -66,17 +66,6 @@ def test_identify_reports_what_the_contract_asks_for(campaign, capsys):
     assert max(map(len, words.splitlines())) <= 100
 
 
-def test_identify_names_directions_that_cannot_be_seen(campaign, capsys):
-    arguments = ("identify", campaign, "--effects", "link_geometry,joint_compliance")
-    d = ok(capsys, *arguments, "--readings", "absolute", "--json").document
-    assert d["model"] == ["base_frame", "link_geometry", "joint_compliance"]
-    assert d["unidentifiable"]
-    assert any("link_geometry" in direction for direction in d["unidentifiable"])
-    unseen = [p for p in d["parameters"] if not p["identifiable"]]
-    assert unseen
-    assert all(p["value"] is None and p["std"] is None for p in unseen)
-
-
 @pytest.mark.long
 def test_all_scalings_stand_side_by_side(campaign, capsys):
     d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document

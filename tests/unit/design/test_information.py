@@ -261,7 +261,8 @@ def test_problems_that_cannot_be():
     with pytest.raises(CannotAnswerError, match="no candidate pose is allowed"):
         problem(a, config, np.empty((0, 6)))
     bare = config.model_copy(update={"loads": ()})
-    refusal(r"needs \[\[loads\]\]", problem, a, bare, poses_of(3))
+    for begun in (problem, prediction_poses):
+        refusal(r"needs \[\[loads\]\]; give one, or", begun, a, bare, poses_of(3))
     with pytest.raises(InputError, match=r"model: unknown effect 'joint_complience'.*valid:"):
         nominal_model(cell.with_config(config_of(model=("joint_complience",))))
     with pytest.raises(InputError, match="against: unknown effect 'ghost'"):
@@ -355,14 +356,6 @@ def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
     p = made(against=("hysteresis",), poses=10)
     assert len(p.of_effect("hysteresis")) == 6
     assert any("approach of the readings drawn at random" in note for note in p.notes)
-
-
-def test_deflections_without_loads_are_refused_wherever_a_plan_begins():
-    config = config_of("deflection").model_copy(update={"loads": ()})
-    a, q = nominal_model(CELL.with_config(config)), poses_of(3)
-    for begun in (lambda: problem(a, config, q), lambda: prediction_poses(a, config, q)):
-        with pytest.raises(InputError, match=r"needs \[\[loads\]\]; give one, or"):
-            begun()
 
 
 def test_derivatives_where_the_robot_works():

@@ -131,7 +131,7 @@ def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
 
 def test_the_prior_of_a_few_arms_is_as_wide_as_their_spread_is_uncertain(one):
     rng, inside = np.random.default_rng(8), []
-    for seed in range(24):
+    for seed in range(18):
         prior = pool(members(one, 200 + seed, arms=4), ()).prior
         joint = [one.names.index(name) for name in prior.names]
         std = np.sqrt(np.diag(np.linalg.inv(prior.information)))

@@ -152,7 +152,7 @@ def test_the_error_falls_as_far_as_predicted(done):
 def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_path, capsys):
     """Alone "94 % are removed" would be said, beside bands that none of its points keeps."""
     d = drawn_calibration(
-        tmp_path / "run.hilcal", poses=20, validation=8, readings="absolute",
+        tmp_path / "run.hilcal", poses=12, validation=6, readings="absolute",
         config=small_config(readings="absolute"),
     )  # fmt: skip
     while (step := d.procedure.next()).kind != "done":
