@@ -204,18 +204,6 @@ def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
     assert sim.admin()["payload"] == cases.MASS
 
 
-@pytest.mark.long
-def test_motion_in_a_world_that_goes_faster(tmp_path):
-    with (
-        closing(cases.start(tmp_path, scale=20.0)) as running,
-        closing(cases.controlled(running, clock=20.0)) as arm,
-    ):
-        goal = cases.displaced_joints(arm, by=2.0)
-        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
-        cases.finish(arm)
-        np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
-
-
 def test_controller_that_does_not_tell_its_payload(tmp_path):
     with (
         closing(cases.start(tmp_path, "--version", "5.4.0.0")) as running,

@@ -563,21 +563,6 @@ def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     assert b.store.rows == []
 
 
-@pytest.mark.long
-def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
-    jogged = []
-
-    def jog(seconds):
-        if len(b.world.at_start) == 3 and not jogged:
-            jogged.append(1)
-            b.world.q = b.world.q + 3e-4
-
-    call_before(b.rig.force, "average", jog)
-    b.measure(usual_plan())
-    assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
-    assert len(b.store.rows) == len(usual_plan().steps)
-
-
 def test_at_least_twenty_frames_whatever_the_clock():
     """The window of a fast clock is too short for a real line of 100 Hz."""
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, force_window_s=0.05))
