@@ -10,10 +10,15 @@ displacement, zero before k,
 is χ² distributed without a step, if the variances are known. Variances that are estimated from
 readings with a step contain it: the larger it is, the less significant it seems. So the variances
 are estimated from the readings less the best step of the sensor, of the target or of a joint,
-whichever makes them most likely. The likelihood ratio is computed from the gain w with ν degrees of
-freedom, ν log(1 + w/ν), since the size of the noise is estimated, too. The largest ratio counts, at
-a level divided by the number of places; the sensor, the target and all joints together have half of
-the level each.
+whichever makes them most likely. As the size of the noise is estimated, too, the gain w with ν
+degrees of freedom is the likelihood ratio λ = ν log(1 + w/ν), and without a step of rank r
+
+    (exp(λ/ν) − 1) (ν − r)/r ~ F(r, ν − r)
+
+But a step may also take up what few readings attribute to effects, whose variances are then
+estimated too small. So both this λ and twice the gain of the log posterior by the best step, all
+variances estimated with it and without it, must be significant. The level is divided by the number
+of places; the sensor, the target and all joints together have half of it each.
 
 A drift resembles a step, above all one that settles, as of an arm that warms up: a step has to
 explain the readings better than each drift of `SETTLING` by 20 : 1.
@@ -99,14 +104,17 @@ def step_in_order(fit: Fit) -> OrderStep | None:
             if f.kind in (SENSOR, TARGET, joint)
             for without in [replace(readings, value=readings.value - f.shift(kinds))]
         ]
-        e = equations(problem, max(freed, key=log_posterior).log_std)
+        with_step = max(freed, key=log_posterior)
+        gain = 2.0 * (log_posterior(with_step) - log_posterior(e))
+        e = equations(problem, with_step.log_std)
     except (CannotAnswerError, np.linalg.LinAlgError):
         return None
     found, drift = _best_steps(e, units, kinds)
     best, serial = found[0], fit.readings.serial
     if serial is not None:
         drift = max(drift, 2 * serial.log_likelihood_ratio)
-    if best.p_value >= LEVEL or best.score < drift + 2 * SAME_EVIDENCE:
+    p_value = max(best.p_value, best.p_value_of(gain))
+    if p_value >= LEVEL or best.score < drift + 2 * SAME_EVIDENCE:
         return None
     size = float(np.sqrt(np.mean(np.sum(best.shift(kinds)[best.first :, :3] ** 2, axis=1))))
     remaining = float(e.target @ e.residual)
@@ -116,7 +124,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         ),
         first=int(rows[best.first]),
         previous=int(rows[best.first - 1]),
-        p_value=best.p_value,
+        p_value=p_value,
         shift_m=size,
         share=best.gain / remaining,
     )
@@ -130,8 +138,23 @@ class _Step:
     first: int  # row of the first reading after it
     gain: float
     score: float  # likelihood ratio less twice the rank
-    p_value: float
+    rank: int  # r
+    freedom: float  # ν
+    tests: int  # number of tested places and kinds
     displacement: Floats  # (q,)
+
+    @property
+    def p_value(self) -> float:
+        """p-value of the step's likelihood ratio; see `p_value_of`."""
+        return self.p_value_of(self.score + 2 * self.rank)
+
+    def p_value_of(self, ratio: float) -> float:
+        """p-value of a likelihood ratio, times the number of tests, at most 1."""
+        rest = self.freedom - self.rank
+        if rest <= 0.0 or ratio <= 0.0:
+            return 1.0
+        f = np.expm1(ratio / self.freedom) * rest / self.rank
+        return min(self.tests * float(scipy.stats.f.sf(f, self.rank, rest)), 1.0)
 
     def shift(self, kinds: dict[str, Floats]) -> Floats:
         """(N, m) shift of each reading."""
@@ -159,9 +182,8 @@ def _best_steps(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[
         gain, rank, displacement = steps[k]
         ratio = _likelihood_ratio(gain, freedom)
         alike = 1 if kind in (SENSOR, TARGET) else len(kinds) - 2
-        tests = 2 * alike * len(steps)
-        p = min(tests * float(scipy.stats.chi2.sf(ratio, rank)), 1.0)
-        step = _Step(kind, FEWEST_IN_RUN + k, gain, ratio - 2 * rank, p, displacement)
+        tests, score = 2 * alike * len(steps), ratio - 2 * rank
+        step = _Step(kind, FEWEST_IN_RUN + k, gain, score, rank, freedom, tests, displacement)
         found.append(step)
     return sorted(found, key=lambda f: -f.score), drift
 

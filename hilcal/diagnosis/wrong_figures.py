@@ -3,8 +3,9 @@
 They are tried before any effect is named: a factor of all wrenches of one load, a factor of the
 tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure beside the model,
 which is refitted in every step. A figure is named if it explains nearly all of the misfit, is
-better than any effect of the catalogue by the Bayesian information criterion, and differs from the
-stated figure by more than rounding.
+better than any effect of the catalogue by the Bayesian information criterion, predicts poses left
+out better, and differs from the stated figure by more than rounding, to a value that the arm can
+bear: of few readings an impossible tool explains nearly any misfit.
 
 Where no effect of the catalogue explains the misfit, the direction of gravity in base axes is
 tried, too: the axes of the base as starts, the best of them refined; and whether the forces of a
@@ -19,7 +20,9 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal.config.cell import STANDARD_GRAVITY_M_S2
 from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
@@ -55,6 +58,8 @@ MISTAKE_FACTOR = {"load": 1.2, "tool_mass": 1.3}
 LARGEST_STEP = 0.5  # most of a mass that one step removes, as a share; a step trebles it at most
 WEIGHT_COSINE = 0.999  # cosine to gravity from which a force is a weight
 MISTAKE_M = 0.02  # shift from which a centre of mass is a mistake, m; a choice
+FARTHEST_COM_M = 1.0  # distance of a possible centre of mass from the flange, m; a choice
+MOST_PAYLOADS = 3.0  # times the arm's payload that a possible tool or load weighs at most; a choice
 MISTAKE_COSINE = 0.985  # of the angle from which gravity's direction is a mistake, 10°; a choice
 DERIVATIVE_STEP: dict[FigureKind, float] = {
     "load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2, "gravity": 1e-2,
@@ -232,8 +237,11 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
         except CannotAnswerError:  # a figure without an equilibrium explains nothing
             continue
         bic = criterion(fit, refit, figure.size)
-        if bic is not None and figure.mistaken(change) and bic < min(best, -BIC_MARGIN):
-            named.append((bic, figure.named(fit, change, refit)))
+        if bic is None or bic >= min(best, -BIC_MARGIN):
+            continue
+        wrong = figure.named(fit, change, refit)
+        if figure.mistaken(change) and _possible(wrong, fit) and predicts_better(fit, refit):
+            named.append((bic, wrong))
     named.sort(key=lambda pair: pair[0])
     found = tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
     passing = [s for s in suspects if s.passes]
@@ -241,6 +249,17 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
         return found
     best = min((s.score.delta_bic for s in passing), default=0.0)
     return _wrong_direction(fit, LEAST_SHARE if passing else LEAST_SHARE_OF_GRAVITY, best)
+
+
+def _possible(figure: WrongFigure, fit: Fit) -> bool:
+    """Whether an arm could have been measured with the figure as it was found."""
+    cell = fit.model.cell
+    if figure.kind == "tool_com":
+        return float(np.linalg.norm(figure.found)) <= FARTHEST_COM_M
+    heaviest = MOST_PAYLOADS * cell.arm.payload
+    if figure.unit == "N":
+        heaviest *= STANDARD_GRAVITY_M_S2
+    return not np.isfinite(heaviest) or figure.found[0] <= heaviest
 
 
 def loads_reversed(fit: Fit) -> bool:
