@@ -310,7 +310,9 @@ class Evidence:
 
     @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
-        """Figures of the cell that seem to be wrong."""
+        """Figures of the cell that seem to be wrong; none where any would explain the readings."""
+        if self.fit.is_saturated:
+            return ()
         stated = self.fit.readings.noise_stated
         if self.misfit or self.fit.outlier.any() or not stated or loads_reversed(self.fit):
             return wrong_figures(self.fit, self.suspects())

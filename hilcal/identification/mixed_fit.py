@@ -148,16 +148,20 @@ def mixed_fit_of(
     return MixedFit(model, readings, theta, variances, coordinates_covariance(variances))
 
 
-def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
+def mixed_fit_at(
+    model: Model, readings: Readings, mode: Mode, theta: Floats, families: Families | None = None
+) -> Variances:
     """Estimate the variances of a model's effects, linearised at fixed parameters theta (P,).
 
     The readings have no gross errors; see `linearised_problem`.
     """
-    problem = linearised_problem(model, readings, mode, theta)
+    problem = linearised_problem(model, readings, mode, theta, families)
     return estimate_variances(problem, sizes_at(problem, model, theta))
 
 
-def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
+def linearised_problem(
+    model: Model, readings: Readings, mode: Mode, theta: Floats, families: Families | None = None
+) -> MixedProblem:
     """Return the linear problem of a model at theta (P,), for readings without gross errors.
 
     The arm's scatter is a part of the noise, unless stated. If it was estimated and the readings
@@ -169,7 +173,7 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
     else:
         readings = readings.as_stated()
     rows = _rows(model, readings, whitening(readings, mode, "gc"))
-    problem = rows.linearised(rows.at(theta), families_of(model))
+    problem = rows.linearised(rows.at(theta), families or families_of(model))
     return problem.compressed() if many else problem
 
 

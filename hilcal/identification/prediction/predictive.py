@@ -18,7 +18,7 @@ variance of the whitened residual, at least 1.
 mean square error. With Y the rows of a fold times the root of C, and X the same rows whitened by W,
 the variance of its prediction from the other folds is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
 
-The uncertainty of the variances of a background makes C larger by how far it moves the parameters
+The uncertainty of the variances of random effects makes C larger by how far it moves the parameters
 (`mixed.variances`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
 (1984) 853). At given variances rows predicted without their fold are off by e with the variance v.
 With x = (log s, η) drawn from its posterior, by weights from the normal approximation at its
@@ -52,6 +52,7 @@ from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.noise.arm_scatter import with_missing_scatter
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
+from hilcal.mixed.families import families_of
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import ArmScatter, Readings, ranges_of
@@ -239,18 +240,17 @@ def predictive(
     pose = distinct_poses(fitted)[stated.reading]
     fold = random_folds(pose)
     noise_factor, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
-    if model.background:
-        variances = mixed_fit_at(model, fitted, mode, theta)
+    variances = _variances_of_random(model, fitted, mode, theta)
+    if variances is not None:
+        least = variance_spread(variances, stated.rows_of(fold))
+        from_variances = _by_variances(variances, model.size)
+    if model.background and variances is not None:
         arm = fitted.arm_scatter  # the standard deviations are in units of its factor
         noise_factor = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
         prior = prior.copy()
         for effect, columns in zip(model.effects, model.slices(), strict=True):
             if effect.name in model.random:  # see `identification.background.background_model`
                 prior[columns] *= np.sqrt(noise_factor)
-        least = variance_spread(variances, stated.rows_of(fold))
-        e = variances.equations
-        motion = e.problem.parameters(e.sensitivity, model.size)
-        from_variances = motion @ variances.covariance @ motion.T
     space = coordinates_of(model)
     chosen = space.prior(prior)
     std = space.prior(open_prior(model, theta, prior))
@@ -368,6 +368,27 @@ def family_prior(model: Model, prior: Floats) -> Floats:
             mean = np.bincount(pool, weights=prior[rows] ** 2) / np.maximum(np.bincount(pool), 1)
             std[rows] = np.maximum(std[rows], np.sqrt(mean)[pool])
     return std
+
+
+def _variances_of_random(
+    model: Model, fitted: Readings, mode: Mode, theta: Floats
+) -> Variances | None:
+    """Variances of a model's random effects; None without any, or where they count as known."""
+    if model.background:
+        return mixed_fit_at(model, fitted, mode, theta)
+    if not model.random or fitted.value.size > MOST_ROWS:
+        return None
+    # as `with_shrunk_effects` fits them, with the arm's scatter in the covariance
+    lines = {e.name for e in model.effects if e.groups() is not None and e.name in model.random}
+    families = families_of(model, set(model.names) - set(model.random), lines)
+    return mixed_fit_at(model, replace(fitted, scatter_stated=True), mode, theta, families)
+
+
+def _by_variances(variances: Variances, size: int) -> Floats:
+    """Covariance (P, P) of the parameters by the uncertainty of the variances."""
+    e = variances.equations
+    motion = e.problem.parameters(e.sensitivity, size)
+    return np.asarray(motion @ variances.covariance @ motion.T)
 
 
 def position_factor(p: Predictive, left_out_m: float) -> float:

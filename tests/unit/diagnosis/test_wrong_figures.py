@@ -10,13 +10,15 @@ import pytest
 import hilcal as hc
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.wrong_figures import BIC_MARGIN, criterion, wrong_figures
+from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit_again
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
 from hilcal.robot.chain import evaluate
-from tests.support.campaigns import NO_EFFECT, campaign
+from studies.study_cases import study_case
+from tests.support.campaigns import NO_EFFECT, campaign, configuration
 from tests.support.fit_cases import refined
 from tests.support.rows import first
 
@@ -118,6 +120,16 @@ def test_effects_are_no_wrong_figures(effect):
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)
+
+
+@pytest.mark.parametrize(("poses", "seed"), [(10, 0), (12, 1), (12, 7)])
+def test_an_impossible_tool_does_not_explain_few_readings(poses, seed):
+    """It did, with a centre of mass metres away, in 20 of 20 such campaigns of 10 poses."""
+    hidden = ("link_geometry", "transmission_error")
+    c = study_case(configuration(), "ur10e", "absolute", hidden, 15.0, seed, n_poses=poses)
+    r = c.readings[np.isin(c.readings.load, (0, 2))]
+    model = baseline(c.cell, r, "absolute") + EffectSpec("link_geometry")
+    assert hc.diagnose(hc.fit(model, r, "absolute")).wrong_figures == ()
 
 
 @pytest.mark.long

@@ -9,11 +9,14 @@ from scipy.stats import chi2
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
-from hilcal.cell import Cell
+from hilcal.cell import Cell, cell_from_config
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.unknown_law import without_remainder
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.injected_effects import Draw, typical_torque, world_without_effect
+from hilcal.drivers.simulated.rehearsal import measurement_noise
+from hilcal.drivers.simulated.rehearsal import simulate as simulate_readings
 from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.background import (
     background_of,
@@ -41,6 +44,7 @@ from studies.all_effects_command import AllEffectsCase, campaign_of
 from studies.all_effects_command import refined as all_effects
 from studies.diagnosis import DiagnosisCase
 from studies.diagnosis_command import simulate
+from studies.few_poses_command import share_in_band
 from studies.random_campaigns import rehearsal_states
 from studies.random_descriptions import readings_of
 from studies.study_cases import study_case, with_study_loads
@@ -539,3 +543,30 @@ def test_a_fit_that_spends_most_readings_is_never_adequate():
     assert last.verdict == "ambiguous"
     assert last.fit.model.background
     assert error(last.fit, r[20:]) < error(before, r[20:])
+
+
+@pytest.mark.long
+def test_the_band_of_shrunk_effects_has_the_uncertainty_of_their_sizes():
+    """25 poses, unloaded and under one load, of arms with errors of links, zeros and gears."""
+    config, inside = configuration(), []
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 4242])
+        cell = cell_from_config(config)
+        loads = [(load.name, load.wrench(cell.gravity)) for load in config.loads][1:2]
+        joint_std = config.repeatability.per_joint(cell.arm.n)
+        world = world_without_effect(
+            cell, rng, noise=measurement_noise(config), joint_std=joint_std
+        )
+        draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
+        physics = world.physics
+        for name in ("link_geometry", "encoder_offset", "transmission_error"):
+            physics = physics.with_effect(name, draw.effect(name, rng))
+        world = replace(world, physics=physics)
+        states, pose, load, cycle = rehearsal_states(cell, 100, loads, rng)
+        names = ("none", *(name for name, _ in loads))
+        r = simulate_readings(world, states, pose, load, cycle, names, rng)
+        some, others = r[r.pose < 25], r[r.pose >= 25]
+        last = refine(baseline(cell, some, "absolute"), some, "absolute")
+        off = others.value - last.fit.predict(others.states).position
+        inside.append(share_in_band(last.fit, others, off))
+    assert np.mean(inside) > 0.93  # 0.88 without it
