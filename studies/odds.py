@@ -25,9 +25,8 @@ from hilcal.config import load_config
 from hilcal.discovery.law import form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import LawTerm, Screen, screen
-from hilcal.discovery.search import search
+from hilcal.discovery.search import averaged, search, structure_of, structures
 from hilcal.discovery.sites import motions_of
-from hilcal.discovery.structures import averaged, structure_of, structures
 from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.identification.baseline import baseline

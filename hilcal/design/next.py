@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.design.criterion import DiscriminatedPairs, Pair
-from hilcal.design.discriminated_pairs import (
+from hilcal.design.choice import (
     LEAST_POWER,
     LEVEL,
     not_ruled_out,
@@ -15,6 +14,7 @@ from hilcal.design.discriminated_pairs import (
     power,
     supported_parameters,
 )
+from hilcal.design.criterion import DiscriminatedPairs, Pair
 from hilcal.design.feasible import FeasibleSpace
 from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.planner import Planned, PlanRequest, Say, order_readings, plan_readings

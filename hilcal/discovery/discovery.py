@@ -41,8 +41,16 @@ from hilcal.discovery.law import (
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine, refit_exactly
 from hilcal.discovery.screen import LawTerm, Screen, screen
-from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search
-from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
+from hilcal.discovery.search import (
+    LEAST_LOG_ODDS,
+    Selection,
+    Structure,
+    averaged,
+    pareto,
+    search,
+    structure_of,
+    structures,
+)
 from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError, expect
 from hilcal.identification.fit import Fit, fit_again, require_gc

@@ -15,7 +15,7 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
-from hilcal.discovery.structures import pareto
+from hilcal.discovery.search import pareto
 from hilcal.identification.fit import Fit
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table

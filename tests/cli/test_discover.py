@@ -14,8 +14,8 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Coefficient, Form, LawPart, source_of_form
 from hilcal.discovery.law import Law as FoundLaw
+from hilcal.discovery.search import Structure
 from hilcal.discovery.sites import sites
-from hilcal.discovery.structures import Structure
 from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.catalogue import read_effects

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.design import mixed_design as condensing
+from hilcal.design import choice as condensing
 from hilcal.design.approximate_design import relax
-from hilcal.design.choice import EFFORT, objective_of
+from hilcal.design.choice import EFFORT, balanced, mixed_design, objective_of, other_effects
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.information import (
     absolute_rows,
@@ -16,7 +16,6 @@ from hilcal.design.information import (
     problem,
     reading_derivatives,
 )
-from hilcal.design.mixed_design import balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import model_after, nominal_model
 from hilcal.design.optimum import best_design
 from hilcal.design.predicted import position_derivative, prediction_poses

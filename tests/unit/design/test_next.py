@@ -8,8 +8,7 @@ import scipy.linalg as sl
 from scipy import stats
 
 from hilcal.cell import cell_from_config
-from hilcal.design.criterion import Pair
-from hilcal.design.discriminated_pairs import (
+from hilcal.design.choice import (
     LEVEL,
     SUPPORTED,
     discriminated_pairs,
@@ -19,6 +18,7 @@ from hilcal.design.discriminated_pairs import (
     power,
     supported_parameters,
 )
+from hilcal.design.criterion import Pair
 from hilcal.design.information import problem
 from hilcal.design.next import DRAWS, plan_separating
 from hilcal.design.nominal_model import model_after

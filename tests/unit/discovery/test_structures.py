@@ -11,8 +11,8 @@ from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.search import Structure, averaged, pareto, posterior
 from hilcal.discovery.sites import sites
-from hilcal.discovery.structures import Structure, averaged, pareto, posterior
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening

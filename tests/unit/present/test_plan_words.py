@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.design.discriminated_pairs import not_ruled_out
+from hilcal.design.choice import not_ruled_out
 from hilcal.design.next import PairPower
 from hilcal.design.summary import PredictedParameter
 from hilcal.present.plan import (
