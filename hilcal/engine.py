@@ -260,11 +260,7 @@ def _serve(line: "Connection[Any, Any]", scratch: str) -> None:
 
 
 def _packed(message: tuple[Any, ...]) -> bytes:
-    """Pickle by protocol 5, which preserves any order of an array's axes in memory.
-
-    The order of sums, and so their last bits, depend on that order; protocol 4 preserves only C and
-    Fortran order.
-    """
+    """Pickle by protocol 5: it keeps an array's order in memory, so the last bits of sums."""
     return pickle.dumps(message, protocol=5)
 
 
@@ -277,10 +273,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _signals_as_exit() -> Iterator[None]:
-    """Raise SystemExit in the block on SIGTERM and SIGHUP.
-
-    By default these end the process at once and leave the workers' folder behind.
-    """
+    """Raise SystemExit on SIGTERM and SIGHUP, which would leave the workers' folder behind."""
 
     def end(number: int, frame: FrameType | None) -> None:
         raise SystemExit(SIGNAL_EXIT + number)

@@ -287,10 +287,7 @@ def n_experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
 def _experiments(
     rng: np.random.Generator, design: StudyDesign, correlations: Sequence[float], runs: int
 ) -> list[_Experiment]:
-    """Return the experiments, each with the state of the generator after the previous ones.
-
-    Each experiment can thus be computed alone, with the random numbers of a serial computation.
-    """
+    """Return the experiments, each with the generator's state in a serial computation."""
     out = []
     for shared in (False, True):
         for rho in map(float, correlations):
@@ -334,10 +331,7 @@ def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[Stud
 
 
 def _fit(w: Whitening, blocks: Floats, noise: Floats) -> tuple[Floats, Floats, float | None]:
-    """Return errors of all runs (n, R), half widths of their intervals (n, R), and mean χ²/dof.
-
-    `noise` (D, 6, R): errors of the deflections.
-    """
+    """Return errors and half intervals (n, R) of all runs, mean χ²/dof, of noise (D, 6, R)."""
     a = w.whiten(blocks).reshape(-1, blocks.shape[-1])
     e = w.whiten(noise).reshape(-1, noise.shape[-1])
     q, r = np.linalg.qr(a)

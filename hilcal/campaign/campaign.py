@@ -528,10 +528,7 @@ class Campaign(Brief):
 def _judged(
     fits: Sequence[Fit], history: Callable[[Fit], History], say: Say, whole_catalogue: bool
 ) -> Sequence[Diagnosis | None]:
-    """Diagnose a fit, or fits that name more and more effects of one background.
-
-    For `whole_catalogue` see `judge`.
-    """
+    """Diagnose a fit, or fits that name more and more effects of one background."""
     if fits[0].scaling != "gc":
         return [None]
     if len(fits) == 1:

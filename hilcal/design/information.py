@@ -296,10 +296,7 @@ def _terms(
 def _layout(
     candidates: Candidates, mode: Mode, m: int, size: int
 ) -> tuple[tuple[tuple[int, tuple[str, ...]], ...], int, tuple[str, ...]]:
-    """Return pose and loads of each unit, the largest number of rows of a unit, and notes.
-
-    Loads are combined in fewer ways where memory does not suffice.
-    """
+    """Return pose and loads of each unit, the largest number of rows of a unit, and notes."""
     patterns, pattern = np.unique(candidates.allowed, axis=0, return_inverse=True)
     pattern = pattern.reshape(-1)
     tally = np.bincount(pattern, minlength=len(patterns))

@@ -261,10 +261,7 @@ def plan_readings(
 def _reference(
     space: FeasibleSpace, drawn: DrawnPoses, rng: np.random.Generator
 ) -> tuple[Floats, Ints]:
-    """Return the reference (n,), which bears every load, and the indices of the other poses.
-
-    It is the one of several central poses from which most poses are reachable.
-    """
+    """Return a central reference (n,) that bears every load, and the other poses' indices."""
     useful = np.asarray(drawn.allowed.any(axis=0))  # loads that some pose bears
     bears = np.flatnonzero(drawn.allowed[:, useful].all(axis=1))
     if not len(bears):

@@ -154,10 +154,8 @@ def _of_ur(
 def _housing(
     name: str, body: int, origin: Floats, low: float, high: float, radius: float
 ) -> Capsule:
-    """Return a capsule for a housing about an axis along z through `origin`, from `low` to `high`.
-
-    Its segment ends half a radius inside of the housing, or in the middle of a short one.
-    """
+    """Return a capsule for a housing along z through `origin`, from `low` to `high`."""
+    # the segment ends half a radius inside of the housing, or in the middle of a short one
     rim = min(_RIM * radius, 0.5 * (high - low))
     return Capsule(name, body, origin + (low + rim) * _Z, origin + (high - rim) * _Z, radius)
 
