@@ -457,9 +457,9 @@ class Path:
         if fitted is None:
             return False
         named = last.fit
-        if np.any(fitted.outlier & ~named.outlier):  # compared without the same gross errors
+        if np.any(fitted.outlier != named.outlier):  # compared without the same gross errors
             try:
-                named = fit_again(named, outlier=fitted.outlier | named.outlier)
+                named = fit_again(named, outlier=fitted.outlier)
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
         better = background_is_better(named, fitted)

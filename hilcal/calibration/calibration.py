@@ -95,14 +95,14 @@ class Calibration(Brief):
     loads: Mapping[str, Floats]  # (6,) wrench at the load point, base axes, by load of the cell
     source: Mapping[str, Any]  # origin of the calibration, for people
     sensor: SensorMount | None = None  # pose of the force sensor; None without one
+    refuted_by: tuple[int, int] | None = None
+    """Points within their 95 % band, of all points of a test that refutes the bands, see
+    `improvement.refuted`; None: not refuted, or not tested."""
     covariance_source: CovarianceSource | None = None  # None where `root` is stated
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     """Means that replace columns of `States` that points lack, by column."""
     turn_std: float = 0.0
     """rad, about each axis: how far the flange may be turned beside the target, see `_turn_std`."""
-    refuted_by: tuple[int, int] | None = None
-    """Points within their 95 % band, of all points of a test that refutes the bands, see
-    `improvement.refuted`; None: not refuted, or not tested."""
 
     @cached_property
     def _tracked(self) -> ToolPose:

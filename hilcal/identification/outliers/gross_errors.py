@@ -13,7 +13,9 @@ The set grows by the reading that the others predict worst, by Baarda's test of 
 present variances, and that of the largest odds is taken: while several gross errors inflate the
 variances, the odds of the first may be low, but the largest test is not small.
 
-Readings that a fit with fewer effects set aside are restored if the others predict them well.
+Readings that a fit with fewer effects set aside are restored if the others predict them well, or if
+the odds that they have gross errors are not above one: few others are fitted by small sizes of the
+effects, which do not predict what larger sizes explain in all readings.
 
 Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
 """
@@ -68,8 +70,7 @@ def find_gross_errors(mixed: MixedFit, mode: Mode) -> Bools:
         start = np.insert(log_std, families, np.zeros(len(shifted)))
         estimate = estimate_variances(_with_shifts(problem, shifts, shifted), start, search=True)
         log_std = np.delete(estimate.log_std, families + np.arange(len(shifted)))
-        price = len(shifted) * np.log(count / FALSE_ALARMS)
-        odds = log_posterior(estimate.equations) - without - price
+        odds = log_posterior(estimate.equations) - without - _price(len(shifted), count)
         if odds > best:
             best, found = odds, len(shifted)
     out = np.zeros(count, dtype=np.bool_)
@@ -82,8 +83,8 @@ def confirmed_gross_errors(
 ) -> Bools:
     """Return which of the set-aside readings, `outlier` (N,), are confirmed as gross errors (N,).
 
-    The mixed fit is to all other readings. A reading is not confirmed if a good one would be as far
-    from the prediction by chance.
+    The mixed fit is to all other readings. None is confirmed where the odds of all together are not
+    above one, nor one where a good reading would be as far from the prediction by chance.
 
     Raises:
         CannotAnswerError: the mixed model's equations have no solution.
@@ -94,8 +95,15 @@ def confirmed_gross_errors(
     problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
     shifts, families = shift_rows(mixed.model, readings, mode), len(problem.families.random)
     log_std = np.insert(mixed.variances.log_std, families, np.zeros(len(rows)))
+    shifted = _with_shifts(problem, shifts, rows.tolist())
+    with_shifts = log_posterior(estimate_variances(shifted, log_std).equations)
+    without = log_posterior(
+        estimate_variances(problem, mixed.variances.log_std, search=True).equations
+    )
+    if with_shifts - without <= _price(len(rows), len(readings)):
+        return np.zeros_like(outlier)
     try:
-        e = equations(_with_shifts(problem, shifts, rows.tolist()), log_std)
+        e = equations(shifted, log_std)
     except np.linalg.LinAlgError as error:
         raise CannotAnswerError("the mixed model's equations have no solution") from error
     count, m = len(rows), readings.m
@@ -107,6 +115,11 @@ def confirmed_gross_errors(
     out = outlier.copy()
     out[rows] = scipy.stats.chi2.sf(square, m) * len(readings) <= SUSPECT
     return _with_deflections(out, readings, mode)
+
+
+def _price(shifted: int, count: int) -> float:
+    """Return |O| log 1/π of so many shifted readings of `count`."""
+    return shifted * float(np.log(count / FALSE_ALARMS))
 
 
 def _with_deflections(outlier: Bools, readings: Readings, mode: Mode) -> Bools:
