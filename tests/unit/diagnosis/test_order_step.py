@@ -11,7 +11,8 @@ from hilcal.diagnosis.verdict import diagnose, with_order_step
 from hilcal.identification.baseline import baseline
 from hilcal.present.verdict import headline, message
 from hilcal.refinement import refine
-from tests.support.campaigns import campaign
+from studies.study_cases import study_case
+from tests.support.campaigns import campaign, configuration
 from tests.support.fit_cases import fitted_model
 from tests.support.rows import first
 
@@ -104,3 +105,14 @@ def test_a_step_that_explains_less_than_the_state_is_not_named(monkeypatch):
         step = OrderStep(("sensor",), FIRST, FIRST - 1, 1e-5, 1e-3, share)
         monkeypatch.setattr(verdict, "step_in_order", lambda fit, step=step: step)
         assert (with_order_step(d).step is not None) == named
+
+
+@pytest.mark.long
+def test_few_readings_of_an_arm_with_gears_show_no_step():
+    """It took up what few readings attribute to effects."""
+    hidden = ("link_geometry", "transmission_error")
+    c = study_case(configuration(), "ur10e", "absolute", hidden, 15.0, 10, n_poses=12)
+    readings = c.readings[np.isin(c.readings.load, (0, 2))]
+    d = refine(baseline(c.cell, readings, "absolute"), readings, "absolute").diagnosis
+    assert d.step is None
+    assert d.reason == "background"
