@@ -310,7 +310,7 @@ class Evidence:
 
     @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
-        """Figures of the cell that seem to be wrong; none where any would explain the readings."""
+        """Figures of the cell that seem to be wrong; none of a saturated fit."""
         if self.fit.is_saturated:
             return ()
         stated = self.fit.readings.noise_stated

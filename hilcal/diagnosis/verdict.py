@@ -128,9 +128,9 @@ def diagnose(
 
 
 def with_doubts(d: Diagnosis) -> Diagnosis:
-    """Return a diagnosis with what few readings hide: a step in the order, suspects, or anything.
+    """Return a diagnosis with what is in doubt: a step in the order, a suspect, a saturated fit.
 
-    A saturated fit (see `Fit.is_saturated`) leaves a small residual even of a wrong model.
+    A saturated fit (`Fit.is_saturated`) leaves a small residual even if the model is wrong.
     """
     d = with_unconfirmed_suspect(with_order_step(d))
     few = d.reason == "residual_is_noise" and d.fit.is_saturated

@@ -62,9 +62,7 @@ MOST_NOT_CORRECTED, MOST_POINTS = 6, 12  # listed points: without a correction, 
 MOST_VARIABLES, MOST_POSES = 4, 6  # listed variables; listed poses
 FAR_TURN_RAD = np.radians(5.0)  # correction of a joint that is warned of; arms' errors are 0.1°
 MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
-MOST_GROSS_SHARE = (
-    0.05  # largest share of measurements that can be gross errors of a validation; a choice
-)
+MOST_GROSS_SHARE = 0.05  # most measurements of a validation that can be gross errors; a choice
 NEXT = {
     "register": "If the tracker was moved before these readings: --register fits its place first.",
     "compare": "hilcal compare says what has changed.",

@@ -86,6 +86,13 @@ class _Linear:
     noise_rows: int  # number of rows that no column acts on
     square: float  # their sum of squares
 
+    def covariance(self, v: Floats, beta: float) -> Floats:
+        """V (Q, Q) with the variances v (1 + G,) of the drift and the noise factor β."""
+        total = self.random @ self.random.T + beta * np.eye(len(self.y))
+        for moved in np.flatnonzero(v > NEGLIGIBLE):
+            total += v[moved] * self.drift[moved] @ self.drift[moved].T
+        return np.asarray(total)
+
     def projected(self, covariance: Floats) -> tuple[Floats, Floats]:
         """P for V (Q, Q), and P y."""
         inverse = np.asarray(sl.lapack.dpotri(np.linalg.cholesky(covariance), lower=1)[0])
@@ -163,9 +170,7 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     prior, rows = _linear(model, solution, w)
     used = prior.least_drift if model.prior.drift is None else model.prior.drift
     v = used**2 - prior.least_drift**2
-    total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
-    for moved in np.flatnonzero(v > NEGLIGIBLE):
-        total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
+    total = rows.covariance(v, solution.beta)
     common, out = rows.projected(total), []
     for k, group in enumerate(prior.groups, 1):
         x = rows.drift[k]
@@ -223,10 +228,8 @@ def _log_posterior(model: Model, solution: Solution, w: Whitening, beta: float) 
     prior, rows = _linear(model, solution, w)
     assert model.prior is not None  # noqa: S101 - see `_linear`
     used = prior.least_drift if model.prior.drift is None else model.prior.drift
-    v, total = used**2 - prior.least_drift**2, rows.random @ rows.random.T
-    total += beta * np.eye(len(total))
-    for moved in np.flatnonzero(v > NEGLIGIBLE):
-        total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
+    v = used**2 - prior.least_drift**2
+    total = rows.covariance(v, beta)
     noise = rows.noise_rows * np.log(beta) + rows.square / beta
     of_drift = np.log1p(np.maximum(v, 0.0) / _drift_scale2(prior)).sum()
     return _log_likelihood(total, rows.flat, rows.y) - float(noise / 2 + of_drift)

@@ -14,8 +14,8 @@ present variances, and that of the largest odds is taken: while several gross er
 variances, the odds of the first may be low, but the largest test is not small.
 
 Readings that a fit with fewer effects set aside are restored if the others predict them well, or if
-the odds that they have gross errors are not above one: few others are fitted by small sizes of the
-effects, which do not predict what larger sizes explain in all readings.
+the odds that they have gross errors are not above one: where few readings remain, small sizes of
+the effects fit these, while larger sizes may explain all readings.
 
 Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
 """
