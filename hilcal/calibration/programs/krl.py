@@ -321,6 +321,11 @@ class _KrlReader(ProgramReader):
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
 
+    def _set_later(self, name: str, line: int) -> str:
+        """Return the statement after a line that sets a frame, if any: it had another value."""
+        later = [v for v in self.data.get(_key(name), []) if v.file == 0 and v.line > line]
+        return f"line {later[0].line} sets {name}, after its use" if later else ""
+
     def _frame(self, kind: str, value: str, line: int) -> Floats | str:
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
@@ -330,7 +335,7 @@ class _KrlReader(ProgramReader):
             return lack if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         fixed = m is not None and m[2] == "0"  # the flange, or the world
-        if not fixed and (changed := self._change_of(value)):
+        if not fixed and (changed := self._change_of(value) or self._set_later(value, line)):
             return changed
         if m is None or m[1].upper() != kind:
             numbers = self._numbers(value)

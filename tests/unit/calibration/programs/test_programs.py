@@ -376,6 +376,16 @@ def test_points_of_a_frame_that_the_program_changes_are_left(
     assert all(p.not_corrected.endswith(f"changes {changed}") for p in found)
 
 
+def test_a_base_that_the_program_sets_after_its_use_is_unknown(arms, tmp_path):
+    values = "BASE_DATA[5]={X 1,Y 2,Z 3,A 0,B 0,C 0}"
+    copied(
+        "krl", tmp_path, lambda t: t.replace("PTP home1", f"BAS(#BASE,5)\r\nPTP home1\r\n{values}")
+    )
+    points = read("krl", arms, tmp_path, leave=True).program.points
+    left = {p.not_corrected for p in points if p.not_corrected}
+    assert left == {"line 39 sets BASE_DATA[5], after its use"}
+
+
 def test_a_frame_of_the_program_is_a_base_and_no_point(arms, tmp_path):
     numbers = "{X 800,Y -200,Z 150,A 30,B 0,C 0}"
     lines = f"DECL INT i\r\nDECL FRAME table={numbers}"
