@@ -11,7 +11,11 @@ from hilcal.types import Floats
 
 
 class TrackerDrift(Effect):
-    """Station twist that grows linearly with time, sensor axes [m/s, rad/s]."""
+    """Station twist that grows linearly with time, sensor axes [m/s, rad/s].
+
+    After the last reading of the fit the station stays where it is then: how it moves further is
+    not known, and a rate of a few micrometres per hour would be millimetres weeks later.
+    """
 
     name = "tracker_drift"
     summary = "the tracker's station moves linearly in time"
@@ -23,6 +27,8 @@ class TrackerDrift(Effect):
         "time of the first reading.",
         "span_s": "the time over which a drift of ordinary size is reached; unless given, that of "
         "the readings.",
+        "until_s": "the time from which the station stays where it is; unless given, that of the "
+        "last reading.",
     }
 
     def setup(self, states: States) -> None:
@@ -30,8 +36,10 @@ class TrackerDrift(Effect):
         assert states.time is not None  # noqa: S101 - checked at construction
         self.options.setdefault("reference_s", float(states.time.min()))
         self.options.setdefault("span_s", max(float(np.ptp(states.time)), 1.0))
+        self.options.setdefault("until_s", float(states.time.max()))
         self.reference = number(self.name, self.options, "reference_s")
         self.span = positive(self.name, self.options, "span_s")
+        self.until = number(self.name, self.options, "until_s")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -40,8 +48,8 @@ class TrackerDrift(Effect):
         return tuple(Parameter(f"{r}{a}", u, 2e-4 / self.span) for r, u in units for a in "xyz")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Unit twists times the time since the reference."""
+        """Unit twists times the time since the reference, until the station stays."""
         assert s.states.time is not None  # noqa: S101 - checked at construction
-        elapsed: Floats = s.states.time - self.reference
+        elapsed: Floats = np.minimum(s.states.time, self.until) - self.reference
         index = np.arange(6)
         return (Columns("station", index, 0 * index, elapsed[:, None, None] * np.eye(6)),)

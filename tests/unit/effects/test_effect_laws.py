@@ -191,6 +191,13 @@ def test_drift_starts_at_its_reference_time():
         effect = make("tracker_drift", UR10E, states, given)
         station = effect.deviation(rate, situation(UR10E)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)
+    until = float(np.median(states.time))
+    effect = make("tracker_drift", UR10E, states, {"until_s": until})
+    station = effect.deviation(rate, situation(UR10E)).station
+    later = states.time >= until
+    np.testing.assert_allclose(
+        station[later], np.outer(later, rate)[later] * (until - states.time.min())
+    )
 
 
 @pytest.mark.parametrize("name", [*robot_names(), "odd"])
