@@ -5,9 +5,9 @@ them is then explained as well by another, which no other effect of the catalogu
 that drifts in time and a floor that moves with the air temperature displace the readings alike.
 
 An effect's variable x is replaced by its best linear function of another recorded variable y,
-x' = a + b y. The columns of the effect with x' are scored against the model without the effect. If
-their evidence is at most 20 : 1 below that of the effect itself, the readings do not distinguish x
-from y.
+x' = a + b y, within the range of x. The columns of the effect with x' are scored against the model
+without the effect. If their evidence is at most 20 : 1 below that of the effect itself, the
+readings do not distinguish x from y.
 """
 
 from collections.abc import Callable
@@ -107,7 +107,8 @@ def _with_function_of(fit: Fit, effect: Effect, field: str, y: Floats) -> Floats
     situation = solution.prediction.situation
     a = np.column_stack([np.ones(len(y)), y - y.mean()])
     x: Floats = getattr(situation.states, field)
-    changed: dict[str, Any] = {field: a @ np.linalg.lstsq(a, x)[0]}
+    function = np.clip(a @ np.linalg.lstsq(a, x)[0], x.min(axis=0), x.max(axis=0))
+    changed: dict[str, Any] = {field: function}
     states = replace(situation.states, **changed)
     prediction = replace(solution.prediction, situation=replace(situation, states=states))
     swapped = replace(fit, solution=replace(solution, prediction=prediction))

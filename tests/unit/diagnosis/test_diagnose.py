@@ -191,6 +191,16 @@ def test_an_effect_in_time_may_be_one_in_an_air_temperature_that_rises_with_it(w
         assert len(d.to_dict()["confounded"]) == len(d.confounded)
 
 
+def test_a_variable_in_place_of_another_stays_within_its_range():
+    c = hidden("creep", "deflection", 0)
+    air = 20.0 + c.readings.states.load_time / 100.0
+    air[np.argmin(air)] -= 1.0  # by the others, a time under load below zero
+    states = replace(c.readings.states, air_temperature=air, joint_temperature=None)
+    before = fitted_baseline(c, readings=replace(c.readings, states=states))
+    (found,) = diagnose(add(before, "creep")).confounded
+    assert (found.effect, found.instead) == ("creep", ("air temperature",))
+
+
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
