@@ -246,7 +246,9 @@ def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
     of many lines, as the waves of one gear (`Effect.groups`), chooses the variance of each from
     its few parameters alone, so that it drops real lines and retains false ones by chance. With a
     prior size common to the lines of a pool (`Effect.pools`, see `mixed.families`) the error of
-    simulated transmission errors at fresh poses fell to 0.9. The noise is that of the fit.
+    simulated transmission errors at fresh poses fell to 0.9. The noise is that of the fit. Flat
+    parameters start at the fit's: a direction that the readings do not show stays where it starts,
+    and the mixed model, which knows no ordinary size of a flat one, can leave it at any value.
 
     Returns:
         The fit; None where all effects are flat, or the readings are too many.
@@ -265,8 +267,11 @@ def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
         mixed = mixed_fit_of(model, inliers, fitted.mode, set(model.names) - shrunk, lines & shrunk)
         std = mixed.prior_std() / mixed.std(INSTRUMENT)
         parts = zip(model.effects, model.slices(), strict=True)
-        random = {**model.random, **{e.name: std[rows] for e, rows in parts if e.name in shrunk}}
-        return fit(replace(model, random=random), fitted.readings, fitted.mode, start=mixed.theta)
+        random, start = dict(model.random), fitted.theta.copy()
+        for e, rows in parts:
+            if e.name in shrunk:
+                random[e.name], start[rows] = std[rows], mixed.theta[rows]
+        return fit(replace(model, random=random), fitted.readings, fitted.mode, start=start)
     except CannotAnswerError:
         return None
 

@@ -17,6 +17,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import Draw, typical_torque, world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.rehearsal import simulate as simulate_readings
+from hilcal.effects.catalogue import installed
 from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.background import (
     background_of,
@@ -33,7 +34,9 @@ from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
 from hilcal.library import refine as search_laws
 from hilcal.mixed.variances import evidence
+from hilcal.model.model import Model
 from hilcal.present.verdict import message
+from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
@@ -48,6 +51,8 @@ from studies.few_poses_command import share_in_band
 from studies.random_campaigns import rehearsal_states
 from studies.random_descriptions import readings_of
 from studies.study_cases import study_case, with_study_loads
+from tests.support.arm_cases import arm_of
+from tests.support.arm_cases import cell_of as arm_cell
 from tests.support.campaigns import configuration
 from tests.support.fit_cases import fitted_model, refined
 from tests.support.refusals import refusal
@@ -329,6 +334,34 @@ def test_flat_parameters_of_narrow_poses_predict_others_badly_and_shrunk_ones_do
     shrunk = with_shrunk_effects(flat, ("base_frame", "target_offset"))
     assert shrunk.holdout.rms_sigma < 1.02 * flat.holdout.rms_sigma
     assert error(shrunk, r[~near]) < 0.5 * error(flat, r[~near])
+
+
+def test_what_weights_do_not_show_stays_where_the_fit_holds_it():
+    """Joint 1 of a KUKA arm bears 1e-16 of a weight: its compliance was 1e9 rad/(N·m)."""
+    rng, count = np.random.default_rng(0), 12
+    arm = arm_of("kr10_r1100_2")
+    cell = arm_cell(arm)
+    wrench = np.zeros((2 * count, 6))
+    wrench[1::2, 2] = -90.0
+    states = States(rng.uniform(-1.5, 1.5, (count, arm.n)).repeat(2, axis=0), wrench)
+    numbers = np.arange(2 * count)
+    r = Readings(
+        states=states,
+        pose=numbers // 2,
+        load=numbers % 2,
+        cycle=0 * numbers,
+        value=np.zeros((2 * count, 3)),
+        covariance=np.full((2 * count, 1, 1), 1e-10) * np.eye(3),
+        load_names=("none", "9kg"),
+        pose_names=tuple(f"P{k}" for k in range(count)),
+    )
+    model = Model(cell, (), installed(), r) + "joint_compliance" + "load_point"
+    true = np.concatenate([np.full(arm.n, 2e-5), [0.03, 0.0, 0.05]])
+    value = model.predict(states, true).observation.position
+    r = replace(r, value=value + 1e-5 * rng.standard_normal(value.shape))
+    shrunk = with_shrunk_effects(fit(model, r, "deflection"), ["joint_compliance"])
+    assert abs(shrunk.theta[0]) < 1e-5
+    assert np.allclose(shrunk.theta[1:3], 2e-5, atol=2e-6)
 
 
 def test_without_added_effects_nothing_is_shrunk():
