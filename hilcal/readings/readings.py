@@ -471,8 +471,10 @@ def in_groups(group: Ints, *first_by: Ints | Bools) -> tuple[Ints, Ints, Ints]:
 
 
 MARGIN = 0.02  # share of the fitted range by which values may exceed it; a choice
-MARGIN_K = 1.0
-"""The same of temperatures: a metre of aluminium grows by 23 µm with it. A choice."""
+LEAST_MARGIN = {"K": 1.0, "rad": 0.01, "m": 0.01}
+"""The least by which values may exceed it, by unit. A metre of aluminium grows by 23 µm per kelvin.
+A correction moves a joint by some mrad or mm, also one that stood still while measuring. Choices.
+"""
 FULL_TURN = 2.0 * np.pi
 
 
@@ -495,9 +497,10 @@ class Range:
     def beyond(self, values: Floats, *, turning: bool = False) -> Bools:
         """Which values are outside, by more than `MARGIN` of the range; arguments as of `over`.
 
-        Temperatures by more than `MARGIN_K`, if that is larger.
+        By more than `LEAST_MARGIN`, if that is larger.
         """
-        least = MARGIN_K if self.unit == "K" else 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        rounding = 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        least = LEAST_MARGIN.get(self.unit, rounding)
         allowed = max(MARGIN * (self.high - self.low), least)
         return np.asarray(self.over(values, turning=turning) > allowed)
 

@@ -77,6 +77,16 @@ def test_a_joint_a_little_warmer_is_no_extrapolation():
     ]
 
 
+def test_the_correction_of_a_joint_that_stood_still_is_no_extrapolation():
+    still = Range("joint 4 angle", "rad", 0.3, 0.3)
+    assert still.beyond(np.array([0.289, 0.299, 0.301, 0.311])).tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]
+
+
 NAMES = ("R1", "R2", "R3")
 CELL = """
 [robot]
