@@ -13,7 +13,7 @@ absorbing the errors of others: independent priors of the same spread predicted 
 20 poses of the real UR10 and of a real UR5. Components of the noise share nothing.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +71,12 @@ class Families:
         return tuple(f.name for f in self.random)
 
 
-def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str] = ()) -> Families:
+def families_of(
+    model: Model,
+    flat: Collection[str] = (),
+    lines: Collection[str] = (),
+    known: Mapping[str, Floats] | None = None,
+) -> Families:
     """Return the families of a model.
 
     The parameters of one effect with the same unit and in the same pool (as an octave of
@@ -81,15 +86,18 @@ def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str]
     Args:
         flat: effects whose parameters have no prior.
         lines: effects of which each group is a family, a line of its pool.
+        known: standard deviations (q,) of the parameters of effects for which they are known.
     """
     frames: list[Ints] = []
     random: list[Family] = []
     for effect, columns in zip(model.effects, model.slices(), strict=True):
         index = np.arange(columns.start, columns.stop)
-        std = effect.prior_std() if effect.role in FRAME_ROLES else None
+        std = (known or {}).get(effect.name)
+        if effect.role in FRAME_ROLES:
+            std = effect.prior_std()
         if std is not None:
-            known = LogStdPrior(0.0, KNOWN_SPREAD)
-            random.append(Family(effect.name, effect.name, index, std, known, known=True))
+            prior = LogStdPrior(0.0, KNOWN_SPREAD)
+            random.append(Family(effect.name, effect.name, index, std, prior, known=True))
         elif effect.role in FRAME_ROLES or effect.name in flat:
             frames.append(index)
         else:

@@ -336,13 +336,14 @@ def test_flat_parameters_of_narrow_poses_predict_others_badly_and_shrunk_ones_do
     assert error(shrunk, r[~near]) < 0.5 * error(flat, r[~near])
 
 
-def test_what_weights_do_not_show_stays_where_the_fit_holds_it():
+@pytest.mark.parametrize("across_n", [0.0, 1e-4])
+def test_what_weights_do_not_show_stays_where_the_fit_holds_it(across_n):
     """Joint 1 of a KUKA arm bears 1e-16 of a weight: its compliance was 1e9 rad/(N·m)."""
     rng, count = np.random.default_rng(0), 12
     arm = arm_of("kr10_r1100_2")
     cell = arm_cell(arm)
     wrench = np.zeros((2 * count, 6))
-    wrench[1::2, 2] = -90.0
+    wrench[1::2, [0, 2]] = across_n, -90.0
     states = States(rng.uniform(-1.5, 1.5, (count, arm.n)).repeat(2, axis=0), wrench)
     numbers = np.arange(2 * count)
     r = Readings(
@@ -362,6 +363,9 @@ def test_what_weights_do_not_show_stays_where_the_fit_holds_it():
     shrunk = with_shrunk_effects(fit(model, r, "deflection"), ["joint_compliance"])
     assert abs(shrunk.theta[0]) < 1e-5
     assert np.allclose(shrunk.theta[1:3], 2e-5, atol=2e-6)
+    # nor does the uncertainty of the variances move it
+    std = np.sqrt(np.diag(predictive_of(shrunk).covariance))
+    assert std[0] < 1.1 * shrunk.model.effects[0].magnitudes[0]
 
 
 def test_without_added_effects_nothing_is_shrunk():
