@@ -247,8 +247,8 @@ def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
     its few parameters alone, so that it drops real lines and retains false ones by chance. With a
     prior size common to the lines of a pool (`Effect.pools`, see `mixed.families`) the error of
     simulated transmission errors at fresh poses fell to 0.9. The noise is that of the fit. Flat
-    parameters start at the fit's: a direction that the readings do not show stays where it starts,
-    and the mixed model, which knows no ordinary size of a flat one, can leave it at any value.
+    effects start at zero: a direction that the readings do not show stays where it starts, and the
+    mixed model, which knows no ordinary size of a flat effect, can leave it at any value.
 
     Returns:
         The fit; None where all effects are flat, or the readings are too many.
@@ -271,6 +271,8 @@ def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
         for e, rows in parts:
             if e.name in shrunk:
                 random[e.name], start[rows] = std[rows], mixed.theta[rows]
+            elif roles[e.name] not in FRAME_ROLES:
+                start[rows] = 0.0
         return fit(replace(model, random=random), fitted.readings, fitted.mode, start=start)
     except CannotAnswerError:
         return None
