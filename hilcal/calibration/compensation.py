@@ -244,7 +244,12 @@ class ErrorSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolPoses(Brief):
-    """Poses of the tool at N points, base axes."""
+    """Poses of the tool at N points, base axes.
+
+    A fit to deflections knows where a load moves the tool, not where the tool is: its positions are
+    off by the errors of the arm, and covariance and band are those of `position` minus
+    `nominal_position`, the displacement by the load.
+    """
 
     position: Floats  # (N, 3) m
     rotation: Floats  # (N, 3, 3)
@@ -253,7 +258,7 @@ class ToolPoses(Brief):
     deflections."""
     nominal_rotation: Floats  # (N, 3, 3)
     covariance: Floats | None
-    """(N, 3, 3) of the true position about `position`, m²; None if `std` is false."""
+    """(N, 3, 3) of the true position about `position`, m²; None if `std` is false. See above."""
     outside: tuple[Outside, ...]  # measured ranges that the points leave
 
     @property
