@@ -308,7 +308,8 @@ def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -
         by = f"{travel[joint]:.2g} {arm.unit(joint)}"
         raise InputError(
             f"{table.path}: columns {', '.join(POSITION)}: the joints move by {by} but "
-            f"all positions lie within {spread:.2g} m; expected the measured positions in m"
+            f"all positions lie within {spread:.2g} m; expected the measured positions in m, also "
+            "of deflections, which are made from them"
         )
 
 
@@ -390,6 +391,26 @@ def check_names(table: ColumnTable) -> None:
     if odd:
         i = table.text["load"].index(odd[0])
         raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
+
+
+def check_differences(table: ColumnTable, loaded: Bools, pose: Ints) -> None:
+    """Refuse deflections in place of readings: what was read unloaded is zero in every pose.
+
+    `loaded` and `pose` are of the rows (N,). A plane that is touched may read zero in all of them.
+    """
+    if loaded.all() or not loaded.any() or len(np.unique(pose[~loaded])) < 3:
+        return
+    for names in (POSITION, *((value,) for value, _, _ in SCALAR.values())):
+        if names[0] not in table.number:
+            continue
+        value = table.matrix(names)
+        if not np.nan_to_num(value[~loaded], nan=1.0).any() and np.nansum(value[loaded] ** 2) > 0:
+            raise InputError(
+                f"{table.path}: {', '.join(names)}: 0 in every unloaded reading, so these "
+                "are deflections; readings are expected, from which they are made. Add to all "
+                "readings of a pose what the controller states there: the target's position in "
+                'base axes ([tracker] frame = "base"), or its height over the gauge\'s plane'
+            )
 
 
 def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats, arm: Arm) -> None:

@@ -86,6 +86,8 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
+    loaded = np.array([name != UNLOADED for name in table.text["load"]], dtype=np.bool_)
+    columns.check_differences(table, loaded, pose)
     observed = columns.observer_rows(table)
     positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, positioned)

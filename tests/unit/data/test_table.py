@@ -145,6 +145,12 @@ def test_positions_that_do_not_move_with_the_joints(tmp_path):
     refusal("all positions lie within", read_table, tmp_path / "t.csv", ARM, None)
 
 
+def test_deflections_in_place_of_readings_are_refused(write):
+    zero = {"x_m": "0", "y_m": "0", "z_m": "0"}
+    rows = [row | zero if row["load"] == "none" else row for row in good()]
+    refusal("these are deflections", read_table, write(rows), ARM, None)
+
+
 def test_row_numbers_count_blank_lines(tmp_path):
     write_table(simple_readings(90), tmp_path / "t.csv")
     lines = (tmp_path / "t.csv").read_text().splitlines()
