@@ -33,6 +33,7 @@ from hilcal.types import Bools, Floats, Ints
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 MAX_TIME_S = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
+OTHER_LOAD = 0.02  # share by which a table's force may differ from the cell's unsaid; a choice
 LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
 
 
@@ -356,23 +357,38 @@ def _instrument_covariance(
 
 
 def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
-    """Give loads without force in a table the wrench of the cell's `[[loads]]`, by name."""
+    """Give loads without force in a table the wrench of the cell's `[[loads]]`, by name.
+
+    A note tells of forces in the table whose mean is another one than the cell states.
+    """
 
     def plain(name: str) -> str:
         return "".join(name.split()).casefold()
 
     s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
     wrenches = {plain(load.name): load.wrench(gravity) for load in config.loads}
-    wrench, notes = s.wrench.copy(), []
+    wrench, notes, others = s.wrench.copy(), [], []
     for k in np.unique(readings.load):
         name = readings.load_names[k]
-        if name == UNLOADED or s.wrench[readings.load == k].any():
+        if name == UNLOADED:
+            continue
+        stated = wrenches.get(plain(name), np.zeros(6))[:3]
+        if s.wrench[readings.load == k].any():
+            off = np.linalg.norm(s.wrench[readings.load == k, :3].mean(axis=0) - stated)
+            if 0 < OTHER_LOAD * np.linalg.norm(stated) < off:
+                others.append(f"{name} (by {off / np.linalg.norm(stated):.1%})")
             continue
         origin = "is not stated by the table, nor by [[loads]] of the cell: it is taken as 0"
         if plain(name) in wrenches:
             wrench[readings.load == k] = wrenches[plain(name)]
             origin = "is that of [[loads]] of the cell, since the table states none"
         notes.append(f"load {name}: its force {origin}")
+    if others:
+        notes.append(
+            "the mean force in the table is another one than by [[loads]] of the cell under "
+            f"{', '.join(others)}: the fit takes the table's, so that errors of the sensor are in "
+            "its compliances; predictions under the names of these loads take the cell's"
+        )
     return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 

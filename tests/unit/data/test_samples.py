@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.tables.importing import import_readings
-from hilcal.tables.table import exchange_columns
+from hilcal.tables.table import exchange_columns, named_loads
 from hilcal.tables.write import write_columns
 from tests.support.campaigns import campaign, configuration
 
@@ -86,3 +86,11 @@ def test_readings_of_a_session_are_no_samples(tmp_path):
     result = import_readings(tmp_path / "t.csv", "table", configuration(), c.cell.arm)
     assert len(result.readings) == len(c.readings)
     assert not notes(result)
+
+
+def test_forces_that_differ_from_those_of_the_cell_are_said():
+    r = campaign("none", "deflection", 0, poses=POSES).readings
+    assert named_loads(r, configuration())[1] == ()
+    more = replace(r, states=replace(r.states, wrench=1.05 * r.states.wrench))
+    (note,) = named_loads(more, configuration())[1]
+    assert "5kg (by 5.0%)" in note
