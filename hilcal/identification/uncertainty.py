@@ -1,10 +1,14 @@
 """Standard uncertainties of the parameters, also with a misfit, and which are identifiable.
 
-While the residual is within the noise, Cov(θ) = T H⁻¹ Tᵀ. With a misfit, errors of neighbouring
-readings are correlated and that formula is far too optimistic. Then the standard uncertainty is
-the largest of three: the formal one times the root of the variance factor, and two delete-a-group
-jackknives, with groups of consecutive readings and with groups close in joint space (Efron and
-Tibshirani, *An Introduction to the Bootstrap*, chapter 11):
+While the residual is within the noise, Cov(θ) = T H⁻¹ Tᵀ. A scaling G other than gc leaves the
+noise correlated, C = G V Gᵀ: then, with the rows B,
+
+    Cov(θ) = T H⁻¹ (Bᵀ C B + β² Λ) H⁻¹ Tᵀ
+
+With a misfit, errors of neighbouring readings are correlated and that formula is far too
+optimistic. Then the standard uncertainty is the largest of three: the formal one times the root of
+the variance factor, and two delete-a-group jackknives, with groups of consecutive readings and with
+groups close in joint space (Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11):
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
@@ -24,6 +28,7 @@ integrated out with a prior of that size: with M the projection off their column
 β Λ (`projection`), A the columns of the others and Λ_z their ridge, Cov(z) = (Aᵀ M A + Λ_z)⁻¹.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +37,7 @@ import scipy
 from hilcal.identification.carried.carried_prior import Coordinates, names_of, prior_of, scales_of
 from hilcal.identification.folds import block_folds, parameter_changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
+from hilcal.identification.noise.full_covariance import whitened_blocks
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
@@ -74,14 +80,15 @@ def uncertainty(
     basis, scale, space = solution.equations.basis, scales_of(model), solution.space
     spread = solution.equations.inverse(solution.beta)
     covariance = solution.transform @ spread @ solution.transform.T
-    variance = np.diag(covariance).copy()
+    stated = covariance
+    if w.scaling != "gc":
+        inner = _of_noise(solution.rows, whitened_blocks(readings, w))
+        inner += np.diag(solution.beta**2 * basis.prior_precision)
+        stated = solution.transform @ spread @ inner @ spread @ solution.transform.T
+    variance = np.diag(stated).copy()
     variance[space.index] += space.omitted_variance / solution.beta
-    noise = solution.beta if w.scaling == "none" else 1.0
-    formal = np.sqrt(np.maximum(variance, 0.0) * noise)
-    misfit, std = (
-        w.scaling != "none" and bool(scipy.stats.chi2.sf(total, dof) < MISFIT_LEVEL),
-        formal,
-    )
+    formal = np.sqrt(np.maximum(variance, 0.0))
+    misfit, std = bool(scipy.stats.chi2.sf(total, dof) < MISFIT_LEVEL), formal
     if misfit:
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]
@@ -102,6 +109,16 @@ def uncertainty(
         factor = factor * dropped_group_factors(*of_model, columns, groups[dropped], beta)
     std = np.where(identifiable, std * factor, np.inf)
     return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
+
+
+def _of_noise(rows: Floats, covariance: Sequence[Floats]) -> Floats:
+    """Return Σ Bᵀ C B (K, K) over the groups of rows B (R, K), C (G, S, S) of each bucket."""
+    out, start = np.zeros((rows.shape[1],) * 2), 0
+    for c in covariance:
+        b = rows[start : start + c.shape[0] * c.shape[1]].reshape(*c.shape[:2], -1)
+        out += np.einsum("gsk,gst,gtl->kl", b, c, b, optimize=True)
+        start += c.shape[0] * c.shape[1]
+    return out
 
 
 def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:

@@ -79,6 +79,22 @@ def test_stated_uncertainties_are_the_sampling_spread(mode, count, seed):
     assert inflated == pytest.approx(0.01, abs=4 * np.sqrt(0.01 * 0.99 / count))
 
 
+@pytest.mark.parametrize("scaling", ["none", "gu", "gc"])
+def test_other_scalings_state_the_spread_of_correlated_noise(scaling):
+    """Four loads share an unloaded reading."""
+    model, readings, truth = design("deflection")
+    model = Model(model.cell, model.effects[2:])
+    clean, rng = read(model, readings, truth[9:]), np.random.default_rng(0)
+    found = fit(model, clean, "deflection", scaling)
+    root = np.linalg.cholesky(clean.covariance)
+    noise = np.einsum("nij,njd->nid", root, rng.standard_normal((*clean.value.shape, 2000)))
+    s, w = found.solution, found.fitted
+    estimates = s.transform @ s.equations.inverse() @ (s.rows.T @ w.whiten_readings(noise))
+    seen = found.uncertainty.identifiable
+    ratio = found.uncertainty.formal[seen] / np.std(estimates[seen], axis=1)
+    assert ratio == pytest.approx(1.0, abs=0.06)
+
+
 def test_uncertainties_fall_with_the_root_of_the_readings():
     model, readings, truth = design("absolute")
     twice, rng = readings[np.tile(np.arange(len(readings)), 4)], np.random.default_rng(0)
