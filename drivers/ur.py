@@ -286,7 +286,7 @@ class UrArm:
 
     def _check_state(self, reading: Reading) -> None:
         """Fail unless the robot is in a state to move."""
-        if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
+        if reading.sample.safety != states.NORMAL:
             self._fail("it is not ready to move")
 
     def _fail_without_effect(self, symptom: str) -> NoReturn:

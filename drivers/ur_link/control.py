@@ -193,10 +193,7 @@ def _check_ready(controller: UrController, receiver: Receiver) -> None:
     """Refuse a robot that cannot be controlled; end a program that a stop has left paused."""
     host, reading = controller.host, receiver.read()
     if reading.sample.safety != states.NORMAL:
-        raise failure(host, reading.sample.safety, states.safety_advice(reading.safety_bits))
-    if reading.mode != states.RUNNING:
-        word = states.mode_word(reading.mode)
-        raise failure(host, f"it is not running ({word})", "switch it on and release the brakes")
+        raise failure(host, reading.sample.safety, reading.advice)
     if probe.in_use(host, controller.registers, 1.0):
         raise failure(host, *_CONTROLLED)
     with contextlib.suppress(LinkError):  # the watchdog ends a program left by us
@@ -326,10 +323,7 @@ def cause_of(controller: UrController, halt: Halt, symptom: str) -> tuple[str, s
     """
     reading = halt.reading
     if reading is not None and reading.sample.safety != states.NORMAL:
-        return reading.sample.safety, f"{states.safety_advice(reading.safety_bits)}, {RESUME}"
-    if reading is not None and reading.mode != states.RUNNING:
-        word = states.mode_word(reading.mode)
-        return f"it does not run any more ({word})", f"switch it on, {RESUME}"
+        return reading.sample.safety, f"{reading.advice}, {RESUME}"
     with contextlib.suppress(LinkError):
         if controller.supervision.in_remote_control(ASK_S) is False:
             return "it was switched to local mode", f"switch it to remote control, {RESUME}"

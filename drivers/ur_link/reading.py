@@ -112,6 +112,11 @@ class Reading:
     runtime: int  # state of the robot's program, 2 is playing
     safety_bits: int  # the safety state as bits
 
+    @property
+    def advice(self) -> str:
+        """What to do about the safety state or the mode; empty if the arm can move."""
+        return states.safety_advice(self.safety_bits, self.mode)
+
 
 def read(answer: dict[str, Any], reduced: bool = False) -> Reading:
     """Return the reading in an answer of the receive worker; raises LinkError.
@@ -131,9 +136,10 @@ def read(answer: dict[str, Any], reduced: bool = False) -> Reading:
     if "target_speed_fraction" in fields:  # the slider; the two multiply
         values["speed_scaling"] *= checked("target_speed_fraction", 0, 10.0)
     bits = int(fields["safety_status_bits"]) & ~(reduced << states.REDUCED)
-    host_ns, safety = int(answer["host_ns"]), states.safety_word(bits)
+    mode = int(fields["robot_mode"])
+    host_ns, safety = int(answer["host_ns"]), states.safety_word(bits, mode)
     sample = ArmSample(host_ns=host_ns, safety=safety, **values)
-    return Reading(sample, int(fields["robot_mode"]), int(fields["runtime_state"]), bits)
+    return Reading(sample, mode, int(fields["runtime_state"]), bits)
 
 
 class Receiver:
@@ -318,11 +324,12 @@ def _state(reading: Reading) -> list[Row]:
     sample, mode = reading.sample, states.mode_word(reading.mode)
     com, celsius = sample.payload_com, sample.joint_temperature
     at = "" if com is None else f" at {_list(1e3 * com)} mm"
+    safety = states.safety_word(reading.safety_bits)
     mass = None if math.isnan(sample.payload) else sample.payload
     payload = "not reported" if mass is None else f"{mass:.3f} kg{at}"
     return [
         ("robot mode", mode, "robot_mode", mode),
-        ("safety", sample.safety, "safety", sample.safety),
+        ("safety", safety, "safety", safety),
         ("payload", payload, "payload_kg", mass),
         ("", "", "payload_com_m", None if com is None else com.tolist()),
         ("joint temperatures", f"{_list(celsius)} °C", "joint_temperature_degC", celsius.tolist()),
@@ -332,10 +339,7 @@ def _state(reading: Reading) -> list[Row]:
 def _state_problems(reading: Reading) -> list[str]:
     out, sample = [], reading.sample
     if sample.safety != states.NORMAL:
-        out.append(f"{sample.safety}: {states.safety_advice(reading.safety_bits)}")
-    if reading.mode != states.RUNNING:
-        word = states.mode_word(reading.mode)
-        out.append(f"it is not running ({word}); switch it on and release the brakes")
+        out.append(f"{sample.safety}: {reading.advice}")
     if reading.runtime in (states.PLAYING, states.RESUMING):
         out.append("a program runs on the robot; stop it on the pendant")
     if math.isnan(sample.payload) or sample.payload_com is None:

@@ -49,14 +49,19 @@ _SAFETY = (
 )
 
 
-def safety_word(bits: int) -> str:
-    """Return the name of the safety state, "normal" if no bit is set."""
-    return next((word for bit, word, _ in _SAFETY if bits >> bit & 1), NORMAL)
+def safety_word(bits: int, mode: int = RUNNING) -> str:
+    """Return the name of the safety state; without a bit, of the mode of an arm with its brakes on.
+
+    "normal": the arm can move.
+    """
+    ready = NORMAL if mode == RUNNING else f"not running ({mode_word(mode)})"
+    return next((word for bit, word, _ in _SAFETY if bits >> bit & 1), ready)
 
 
-def safety_advice(bits: int) -> str:
-    """Return advice about the safety state; empty if normal."""
-    return next((advice for bit, _, advice in _SAFETY if bits >> bit & 1), "")
+def safety_advice(bits: int, mode: int = RUNNING) -> str:
+    """Return advice about the safety state, or the mode; empty if normal."""
+    ready = "" if mode == RUNNING else "switch it on and release the brakes"
+    return next((advice for bit, _, advice in _SAFETY if bits >> bit & 1), ready)
 
 
 def mode_word(mode: int) -> str:

@@ -108,7 +108,8 @@ class ArmSample:
     payload: float  # set in the controller, kg
     payload_com: Floats | None  # (3,) its centre of mass, flange axes, m; None where unknown
     speed_scaling: float  # factor that the controller applies to the speed, 0 to 1
-    safety: str  # safety state in the maker's words; "normal" without problems
+    safety: str
+    """Safety state in the maker's words, or that its brakes hold it; "normal" if it can move."""
     torque: Floats | None = None
     """(n,) measured torques of the drives, averaged since the previous sample, N·m, positive in the
     direction of larger joint values; None where unknown."""

@@ -60,7 +60,7 @@ def test_report_names_everything_that_hinders_a_run(sim):
         sim.admin("local_mode")
         sim.admin("emergency_stop")
         problems = " | ".join(arm.report().problems)
-        for words in ("local mode", 'model = "ur5e"', "emergency stop", "not running (power off)"):
+        for words in ("local mode", 'model = "ur5e"', "emergency stop", "switch the robot on"):
             assert words in problems
         with pytest.raises(DeviceError, match="emergency stop"):
             arm.take_control(1.0, np.zeros(3))
@@ -83,7 +83,7 @@ def test_bad_goals_are_refused_before_anything_moves(arm, sim):
 
 @pytest.mark.parametrize(
     ("bits", "mode", "says"),
-    [(1 << 2, 7, "protective stop"), (1, 5, r"does not run any more \(idle \(brakes on\)\)")],
+    [(1 << 2, 7, "protective stop"), (1, 5, r"not running \(idle \(brakes on\)\); switch it")],
 )
 def test_an_arm_whose_safety_or_mode_is_not_normal_is_not_moved(
     bits, mode, says, arm, sim, monkeypatch
@@ -93,7 +93,7 @@ def test_an_arm_whose_safety_or_mode_is_not_normal_is_not_moved(
 
     def told(receiver, *seconds):
         reading = read(receiver, *seconds)
-        sample = replace(reading.sample, safety=safety_word(bits))
+        sample = replace(reading.sample, safety=safety_word(bits, mode))
         return replace(reading, sample=sample, mode=mode, safety_bits=bits)
 
     before = sim.admin()["q"]

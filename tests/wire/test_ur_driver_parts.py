@@ -83,6 +83,14 @@ def test_gravest_safety_state_comes_first():
         assert states.safety_advice(1 << bit)
 
 
+def test_an_arm_that_its_brakes_hold_is_measured_as_little_as_one_that_was_stopped():
+    """Its sample says so: switched off during a question, it gave one more reading."""
+    off = reading(robot_mode=3)
+    assert off.sample.safety == "not running (power off)"
+    assert off.advice == "switch it on and release the brakes"
+    assert reading(robot_mode=3, safety_status_bits=1 << 7).sample.safety == "emergency stop"
+
+
 def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
