@@ -239,6 +239,16 @@ class Mover:
         self._payload = payload(self.guard.cell, load)
         self._arm.set_payload(*self._payload)
 
+    def payload_left(self) -> str | None:
+        """Return which payload the controller keeps, where a weight may hang; else None."""
+        loads = map(self._limits.shapes.load, self.hanging)
+        if self._payload is None or not any(load is not None and load.mass_kg for load in loads):
+            return None
+        return (
+            f"the controller is set to a payload of {body_text(*self._payload)}: before anybody "
+            "guides the arm by hand, set there what then hangs, or the arm rises or sinks by itself"
+        )
+
     def checked_sample(self) -> ArmSample:
         """Return a sample of the arm, after checks of the arm and of the force sensor.
 

@@ -68,6 +68,8 @@ def run(
         session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
+        with suppress(Exception):  # the error that ends the session is raised
+            session.remark_on_payload()
         failed_before = session.pose is not None and _failed_at(store) == session.pose
         _note(store, error, trouble, session.pose)
         lost = ", and without watching drift" if session.pose == plan.home else ""

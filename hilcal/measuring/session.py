@@ -576,8 +576,14 @@ class Session:
             self._remark(estimate.sentence(self._joint_std))
         if self._hook.hanging != UNLOADED:  # the plan ends so
             self._remark(f"{self._hook.hanging} still hangs on the arm: take it off")
+            self.remark_on_payload()
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
+
+    def remark_on_payload(self) -> None:
+        """Say which payload the session leaves in the controller, where a weight may hang."""
+        if (text := self._mover.payload_left()) is not None:
+            self._remark(text)
 
     def _remark(self, text: str) -> None:
         self._watcher.notify(Remark(text))

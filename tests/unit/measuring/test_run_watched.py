@@ -113,6 +113,20 @@ def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(b, l
     assert set(motions) <= KNOWN
 
 
+@pytest.mark.parametrize(
+    ("load", "after", "fallen"), [("3kg", 0, False), ("none", 1, False), ("3kg", 2, True)]
+)
+def test_after_a_question_the_way_back_is_free_with_either_load(b, load, after, fallen):
+    """The arm was jogged to where the 3 kg would stand in the floor, and the bare tool does not."""
+    jogged(b, load, np.array(POSES["reference"]) + 0.25 * np.eye(6)[1], after=after)
+    if fallen:
+        falls_at_rest(b, "3kg", 4)
+    moved = []
+    call_before(b.rig.arm, "start_move", lambda *_: moved.append(len(b.operator.requests)))
+    refusal_of(DeviceError, r"what hangs \(3kg\) is .* outside", b.measure)
+    assert moved[-1] < len(b.operator.requests)
+
+
 def test_only_a_joint_that_was_moved_is_approached_again(b):
     """The others stand beside their goal by the encoders' noise, which is no motion."""
     plan = plan_of(("p1", "none", 0), ("reference", "3kg", 0), ("reference", "none", 1))
@@ -236,6 +250,20 @@ def test_a_payload_that_others_set_in_the_controller_ends_the_run(b):
     assert not len(FEW_POSES.without(b.store.done()).steps)
 
 
+@pytest.mark.parametrize("ends", [DeviceError("stopped by the operator"), KeyboardInterrupt()])
+def test_a_payload_that_stays_in_the_controller_is_said(b, ends):
+    """Of 3 kg that nobody has hung: an arm that is guided by hand would rise."""
+
+    def gives_up(load, _):
+        if load is not None:
+            raise ends
+
+    call_before(b.operator, "hang", gives_up)
+    with pytest.raises(type(ends)):
+        b.measure(SHORT)
+    assert len(b.remarks("set to a payload of 3.8 kg at")) == 1
+
+
 @pytest.mark.parametrize(
     ("device", "call", "change", "said"),
     [
@@ -243,6 +271,7 @@ def test_a_payload_that_others_set_in_the_controller_ends_the_run(b):
         ("tracker", "measure", {"covariance": np.full((3, 3), np.nan)}, "tracker: it gives a c"),
         ("tracker", "measure", {"covariance": np.zeros((3, 3))}, "not positive definite"),
         ("tracker", "measure", {"value": np.zeros(4)}, r"value of shape \(4,\); valid: \(3,\) or"),
+        ("arm", "sample", {"qd": np.full(6, np.nan)}, "arm: it reports joint angles that are not"),
         ("force", "average", {"wrench": np.full(6, np.nan)}, "force sensor: it gives a value that"),
         ("force", "latest", {"wrench": np.full(6, np.inf)}, "force sensor: it gives a value that"),
     ],
@@ -325,17 +354,23 @@ def falls_in_motion(b, *wrong):
 
 
 def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b):
-    payloads = []
-    stopped = []
+    known, stopped = [], []
     fell, motions = falls_in_motion(b), carried(b)
-    call_before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
     call_before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
+
+    def jog(_):  # while the load is hung again, where the arm was stopped
+        known.append(b.world.payload and b.world.payload[0])
+        b.world.q = b.world.q + 0.1 * np.eye(6)[0] * (len(known) == 3)
+
+    change_result(b.operator, "hang", jog)
     readings = b.measure(usual_plan())
     assert len(readings) == len(usual_plan().steps)
     assert stopped[0] - fell[0] < 0.5
     assert b.requested_loads[1:3] == ["3kg", "3kg"]
     assert "0.0 N where 3kg should hang (29.4 N)" in b.operator.requests[2][1]
-    assert ("none", 0.8) in payloads  # the controller knows that nothing hangs
+    (asked,) = confirmed(b)
+    assert "shoulder_pan is 0.1 rad off" in asked
+    assert known[:3] == [None, 3.8, 0.8]  # the controller knows that nothing hangs
     assert set(motions) == KNOWN  # and that it was hung again
     assert [x["hanging"] for k, x in b.store.events if k == "load"][:3] == ["3kg", None, "3kg"]
     loaded = rows(readings, "3kg")
