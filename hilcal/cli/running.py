@@ -53,6 +53,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, load_plan
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.run_log import (
+    PLAN,
     REHEARSED,
     RunLog,
     changed_since_begun,
@@ -287,10 +288,7 @@ def measure(
             viewer.measuring(campaign.path.name, cell, log)
         total, done = len(log.plan.steps), len(log.done())
         watcher = stack.enter_context(CampaignProgress(t.progress, total, viewer, done))
-        identities = [answer_json(answer) for answer in answers]
-        if not check_same_arm(log, identities):
-            t.notice(f"warning: {campaign.path}: {UNSURE_ARM}")
-        log.event("devices", {"answers": identities})
+        log.event("devices", {"answers": _same_arm(t, campaign, answers)})
         clock = Clock(config.clock)
         run_plan(
             rig, cell, log.plan, log, clock, watcher, LiveModel(cell), goal=goal, epoch=epoch,
@@ -298,6 +296,16 @@ def measure(
         )  # fmt: skip
     estimate_noise(t, cell, campaign)
     return campaign.n_readings
+
+
+def _same_arm(
+    t: Terminal, campaign: CampaignFile, answers: tuple[connect.ConnectionResult, ...]
+) -> list[dict[str, object]]:
+    """Refuse another arm than the campaign's, and say where that is not known; return answers."""
+    identities = [answer_json(answer) for answer in answers]
+    if not check_same_arm(RunLog(campaign), identities):
+        t.notice(f"warning: {campaign.path}: {UNSURE_ARM}")
+    return identities
 
 
 def estimate_noise(t: Terminal, cell: Cell, campaign: CampaignFile) -> None:
@@ -380,6 +388,9 @@ def factory_check(
             "--factory: no kinematics reported by the arm's controller; give [robot] calibration"
         )
     _measure_without_loads(t, path, cell, catalogue, output, yes)
+    with CampaignFile.open(output, read_only=True) as campaign:
+        if answers and campaign.about(PLAN) is not None:
+            _same_arm(t, campaign, answers)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
         checked = check_factory(

@@ -13,6 +13,8 @@ import hilcal.cli.running as running
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.errors import InputError
+from hilcal.measuring.connect import ConnectionResult
+from hilcal.measuring.devices import Report
 from hilcal.procedure.state import BEGUN
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.procedure_log import ProcedureLog
@@ -181,6 +183,16 @@ def test_a_factory_check_goes_on_with_what_it_lacks(tmp_path, capsys, monkeypatc
     ):
         told = run(capsys, *words, *more)
         assert (told.code, said in told.err) == (code, True), told.err
+    # nor is another arm's controller compared with it
+    mine, other = (
+        ConnectionResult("arm", "ur", Report("arm", "UR", facts=(("serial number", n),)))
+        for n in ("1", "2")
+    )
+    with CampaignFile.open(path) as campaign:
+        RunLog(campaign).event("devices", {"answers": [planning.answer_json(mine)]})
+    for answer, said in ((mine, "24 readings are judged"), (other, "number is 2, and the")):
+        monkeypatch.setattr(planning, "answers_of", lambda t, config, found=answer: (found,))
+        assert said in run(capsys, *words).err
 
 
 def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(tmp_path, capsys):
