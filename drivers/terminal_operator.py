@@ -2,6 +2,8 @@
 
 import contextlib
 import math
+import os
+import stat
 import sys
 import termios
 
@@ -16,7 +18,10 @@ _NO_TERMINAL = (
     "operator: standard input is not a terminal, so nobody can be asked to hang a load; "
     "run hilcal in a terminal"
 )
-
+_UNSEEN = (
+    "operator: standard error goes to a file, so nobody sees what is asked; leave out 2>, or keep "
+    "a copy by: 2>&1 | tee FILE"
+)
 
 ANSWERS = "Enter = done, q = give up: "
 
@@ -31,13 +36,13 @@ class TerminalOperator:
         self._console = Console(stderr=True, highlight=False)
 
     def report(self) -> Report:
-        """Report who is asked, and a problem where standard input is no terminal."""
-        answerable = _is_terminal()
+        """Report who is asked, and a problem where nobody sees a question or can answer."""
+        why_not = _why_nobody()
         return Report(
             "operator",
             "the person at this terminal",
             (("asked on", "standard error"), ("answers with", "Enter, or q to give up")),
-            () if answerable else (_NO_TERMINAL,),
+            (why_not,) if why_not else (),
         )
 
     def hang(self, load: CellLoad | None, why: str) -> None:
@@ -50,8 +55,8 @@ class TerminalOperator:
         self._ask(f"Look at the arm: {question}.", ["May it go on?"], "it goes on")
 
     def _ask(self, warning: str, request: list[str], done: str) -> None:
-        if not _is_terminal():
-            raise DeviceError(_NO_TERMINAL)
+        if why_not := _why_nobody():
+            raise DeviceError(why_not)
         self._say()
         if self._console.is_terminal:
             self._console.bell()
@@ -114,11 +119,18 @@ def open_operator(config: CellConfig) -> TerminalOperator:
     return TerminalOperator(config)
 
 
-def _is_terminal() -> bool:
+def _why_nobody() -> str:
+    """Return why nobody sees a question or can answer it; empty if somebody may.
+
+    A pipe may lead to a terminal: `2>&1 | tee FILE`.
+    """
     try:
-        return sys.stdin.isatty()
-    except (AttributeError, ValueError):  # no standard input, or a closed one
-        return False
+        if not sys.stdin.isatty():
+            return _NO_TERMINAL
+        seen = sys.stderr.isatty() or stat.S_ISFIFO(os.fstat(sys.stderr.fileno()).st_mode)
+    except (AttributeError, OSError, ValueError):  # no such stream, or a closed one
+        return _NO_TERMINAL
+    return "" if seen else _UNSEEN
 
 
 def _numbers(values: tuple[float, float, float]) -> str:

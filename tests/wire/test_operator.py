@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -146,6 +147,21 @@ def test_a_closed_terminal_is_no_answer():
         person.type_keys("\x04")  # end of file
         assert person.wait_for_end() == 0
         assert "error: operator: the terminal was closed before it was answered" in person.lines
+
+
+@pytest.mark.parametrize(
+    ("seen", "said"), [("2>asked.txt", "goes to a file"), ("2>&1|cat", "hung")]
+)
+def test_a_question_that_nobody_sees_is_not_asked(seen, said, tmp_path):
+    """Enter, pressed since nothing seems to happen, would be its answer, and the arm would move."""
+    line = f"{shlex.join([sys.executable, *program(['5kg', ''])])} {seen}"
+    script = f"import subprocess; subprocess.run({line!r}, shell=True)"
+    with AtTerminal(command=("-c", script), columns=150, home=tmp_path) as person:
+        if said == "hung":
+            person.wait_for_words(ASKED)
+        person.type_keys("\n")
+        person.wait_for_end()
+        assert said in person.text
 
 
 def test_without_a_terminal_nobody_is_asked():
