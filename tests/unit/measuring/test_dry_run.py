@@ -8,11 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.config import CellLoad, ForceSensor, Limits, Tool
+from hilcal.config import CellLoad, ForceSensor, Limits, Obstacle, Tool
+from hilcal.config.sections import Sight
 from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.feasibility import BETWEEN_M
 from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, route
 from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.rows import first
@@ -128,6 +130,26 @@ def test_torque_under_load_names_pose_load_joint_and_limit():
     found = [line for line in problems(bench, heavy) if "bears" in line]
     assert any("stretched under pull" in line and "shoulder_lift" in line for line in found)
     assert any("0.9 of 330" in line for line in found)
+
+
+def test_what_hangs_is_checked_on_the_way_too_and_in_the_beam():
+    """A stand that the bare tool passes above, and a tracker that looks up past the load."""
+    bench, home = Bench(limits=WIDE), np.array(POSES["reference"])
+    away = home + 0.8 * np.eye(6)[0]
+    middle, end = evaluate(bench.cell.arm, np.array([0.5 * (home + away), away])).point(
+        bench.cell.load_point
+    )
+    poses = {"reference": home, "p1": away}
+    plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1), poses=poses)
+    x, y, z = middle
+    stand = Obstacle(name="stand", bottom_m=(x, y, 0.0), radius_m=0.02, height_m=z - 0.08)
+    found = problems(Bench(limits=WIDE, obstacles=(stand,)), plan)
+    assert [line.partition(":")[0] for line in found] == [
+        "between reference and p1",
+        "between p1 and reference",
+    ]
+    (hidden,) = problems(Bench(limits=WIDE, sight=Sight(tracker_m=tuple(end - [0, 0, 1.0]))), plan)
+    assert hidden == "pose p1: what hangs (3kg) between tracker and target"
 
 
 @pytest.mark.parametrize(("mass", "wrong"), [(12.5 - 0.8, False), (12.5 - 0.8 + 1e-3, True)])
