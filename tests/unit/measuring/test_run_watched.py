@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from hilcal.config import CellLoad
+from hilcal.config import Acquire, CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
@@ -248,6 +248,29 @@ def test_a_payload_that_others_set_in_the_controller_ends_the_run(b):
     b.world.restart()
     b.measure()
     assert not len(FEW_POSES.without(b.store.done()).steps)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"q": 0.003, "q_target": 0.003}, "the arm does not rest at its goal"),
+        ({"q_target": 0.003}, r"somebody else commanded it by 0\.003 rad"),
+        ({"qd": 0.02}, "the arm does not rest at its goal"),
+    ],
+)
+def test_no_reading_is_taken_beside_the_goal_or_in_motion(change, said):
+    """3 mrad are 3 mm at the target, and less than what ends a session at once."""
+    quick = Acquire(samples=3, settle_s=0.2, force_window_s=0.3, settle_timeout_s=1.0)
+    b, arrived = Bench(acquire=quick), []
+
+    def beside(here):
+        by = {n: getattr(here, n) + x * np.eye(6)[0] for n, x in change.items()}
+        return replace(here, **by) if 2 in arrived else here
+
+    call_before(b.rig.tracker, "measure", lambda: arrived.append(len(b.store.rows)))
+    change_result(b.rig.arm, "sample", beside)
+    refusal_of(DeviceError, said, b.measure)
+    assert len(b.store.rows) == 2
 
 
 @pytest.mark.parametrize("ends", [DeviceError("stopped by the operator"), KeyboardInterrupt()])
