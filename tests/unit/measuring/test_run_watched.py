@@ -233,15 +233,18 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
     assert b.world.calls[-2] == "arm.stop"
 
 
-def test_a_payload_that_others_set_in_the_controller_ends_the_run(b):
+@pytest.mark.parametrize(
+    ("kg", "x_m", "told"), [(9.0, 0.0, r"9 kg at \(0.000"), (0.8, 0.05, r"0.8 kg at \(0.050")]
+)
+def test_a_payload_that_others_set_in_the_controller_ends_the_run(b, kg, x_m, told):
     """It changes the arm's deflection and when it stops; a resumed run sets its own."""
 
     def others(*_):
         if len(b.store.rows) == 2:
-            b.world.payload = (9.0, np.zeros(3))
+            b.world.payload = (kg, np.array([x_m, 0.0, 0.06]))
 
     call_before(b.store, "record", others)
-    said = r"set its payload to 9 kg at \(0.000, .*; it was 0.8 kg at \(0.010.*--resume$"
+    said = rf"set its payload to {told}, .*; it was 0.8 kg at \(0.010.*--resume$"
     refusal_of(DeviceError, said, b.measure)
     assert len(b.store.rows) == 3
     assert b.world.calls[-2] == "arm.stop"
