@@ -24,6 +24,8 @@ from hilcal.store.run_log import RunLog
 HOW_ON = "The campaign is safe: run again with --resume"
 EMERGENCY = "press the emergency stop"
 _STOPS = 3  # attempts to stop the arm
+_LATER = (Exception, KeyboardInterrupt)
+"""What may follow the error that ends a session, and must not hide it: it tells of a moving arm."""
 
 
 def run(
@@ -68,7 +70,7 @@ def run(
         session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
-        with suppress(Exception):  # the error that ends the session is raised
+        with suppress(*_LATER):
             session.remark_on_payload()
         failed_before = session.pose is not None and _failed_at(store) == session.pose
         _note(store, error, trouble, session.pose)
@@ -108,7 +110,7 @@ def _stop(arm: ArmDevice) -> str:
 
 def _failed_at(store: RunLog) -> str | None:
     """Return the pose at which the last session that failed did so; None where unknown."""
-    with suppress(Exception):  # the error that ends this session is raised
+    with suppress(*_LATER):
         return (store.last("failed") or {}).get("pose")
     return None
 
@@ -121,10 +123,8 @@ def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -
     if not isinstance(error, HilcalError | KeyboardInterrupt):
         content["trace"] = "".join(traceback.format_exception(error))
     kind = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-    try:
+    with suppress(*_LATER):
         store.event(kind, content)
-    except Exception:  # the first error is raised
-        return
 
 
 def _raise(error: BaseException, trouble: str, failed_before: str | None, skipped: str) -> None:

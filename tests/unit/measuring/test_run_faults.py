@@ -172,6 +172,22 @@ def test_an_arm_that_does_not_stop_is_told_loudly_and_once(fault, stop, said, mo
     assert b.store.events[-1][1]["arm_not_stopped"] == stop
 
 
+def test_impatience_does_not_hide_that_the_arm_may_still_move():
+    """Ctrl-C while it is noted why the session ended: "the arm stands" was said."""
+    b = bench()
+
+    def impatient(kind, _):
+        if kind == "failed":
+            raise KeyboardInterrupt
+
+    def mute():
+        raise DeviceError("arm: no answer to stop")
+
+    call_before(b.store, "event", impatient)
+    b.world.fail[120], b.rig.arm.stop = DeviceError("tracker: silent"), mute
+    refusal_of(DeviceError, r"tracker: silent.*THE ARM MAY STILL MOVE", b.measure, small_plan())
+
+
 def test_impatience_does_not_keep_the_arm_from_stopping():
     """Ctrl-C while the arm is being stopped: it is stopped again."""
     b = bench()
