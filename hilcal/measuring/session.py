@@ -219,6 +219,13 @@ class Session:
         """
         first, last_q = start[0], self._state.last_q
         sample = self._mover.sample_with_free_path(first.q, first.name)
+        turn = np.where(self._cell.arm.slides, 0.0, np.abs(first.q - sample.q))
+        if turn.max() > np.pi:  # said before the question whose answer lets the arm move
+            joint = self._cell.arm.joint_names[int(turn.argmax())]
+            self._remark(
+                f"the first motion turns {joint} by {np.degrees(turn.max()):.0f}°: see that "
+                "cables and hoses bear it, or drive the joint back by hand first"
+            )
         self._hook.take_all_off()
         expected, place = (sample.q, WHERE_LEFT) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(

@@ -78,6 +78,18 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
 
 
+def test_a_joint_that_begins_with_a_whole_turn_is_said_before_the_question(b):
+    """It winds the cables of tool and sensor; joints of such arms have two turns."""
+    b.world.q = b.world.q - 2 * np.pi * np.eye(6)[5]
+    said = []
+    call_before(b.operator, "hang", lambda *_: said.append(len(b.remarks("turns wrist_3 by 35"))))
+    b.measure(SHORT)
+    assert said[0] == 1
+    assert b.remarks("the first motion turns") == b.remarks("turns wrist_3 by 35")
+    b.measure(FEW_POSES)
+    assert len(b.remarks("the first motion turns")) == 1
+
+
 @pytest.mark.long
 def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
     jogged(b, "none", FREE)
