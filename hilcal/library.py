@@ -1,8 +1,9 @@
 """The functions of `import hilcal`: thin, with defaults that suit a script."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+import atexit
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -257,7 +258,7 @@ def baseline(
     Args:
         cell: the cell; or a campaign, for its cell, readings and catalogue.
         data: the readings, where `cell` is no campaign.
-        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
+        readings: "deflection" or "absolute"; None: as for `fit`.
         catalogue: the effects that a model can have; None: the installed ones.
         prior: the posterior of another campaign of this arm, from `load_posterior`, or a prior made
             from one by `carried_prior`. The model has its effects, and fits start from it.
@@ -267,13 +268,13 @@ def baseline(
         CannotAnswerError: the readings do not determine an unknown frame.
     """
     if isinstance(cell, Campaign):
-        data, catalogue = cell.readings if data is None else data, catalogue or cell.catalogue
+        data, catalogue = cell if data is None else data, catalogue or cell.catalogue
         cell = cell.cell
     if data is None:
         raise InputError("a cell without readings; valid: baseline(cell, readings), baseline(run)")
     expect(cell, Cell, "cell", A_CELL)
-    data, carried = _readings(data), _carried(prior, catalogue)
-    return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, carried)
+    given, carried, mode = _readings(data), _carried(prior, catalogue), _mode(readings, data, cell)
+    return starting_models.baseline(cell, given, mode, catalogue, carried)
 
 
 def _readings(data: Readings | Campaign) -> Readings:
@@ -321,7 +322,8 @@ def fit(
     Args:
         model: as of `baseline`, with effects added.
         data: readings, as of `read_table`, or a campaign.
-        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
+        readings: "deflection" or "absolute"; None: that of a campaign's revision in use, else as
+            the cell plans and the data allow.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: the posterior of another campaign of this arm, for the effects that the model shares
             with it (`baseline` adds the others); or (P,) standard deviations of zero-mean priors,
@@ -339,19 +341,19 @@ def fit(
     if data is None:
         raise InputError("a model without readings; valid: fit(model, readings), fit(model, run)")
     expect(model, Model, "model", A_MODEL)
-    data, readings = _readings(data), _either(readings, mode)
+    given, kind = _readings(data), _mode(_either(readings, mode), data, model.cell)
     std: Floats | None = None
     if isinstance(prior, (Posterior, CarriedPrior, *PATHS)):
-        model = _with_prior(model, data, prior)
+        model = _with_prior(model, given, prior)
     elif prior is not None:
         valid = f"{A_PRIOR}, or ({model.size},) standard deviations"
         std = array_of(prior, "prior", valid)
         if std.shape != (model.size,) or not (std >= 0).all():
             raise InputError(f"prior of shape {std.shape} or with values below 0; valid: {valid}")
-    data = with_prior_scatter(model, data)
+    given = with_prior_scatter(model, given)
     if scaling not in SCALINGS:
         raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
-    fitted = fits.fit(model, data, _mode(readings, data, model.cell), scaling, prior=std)
+    fitted = fits.fit(model, given, kind, scaling, prior=std)
     return with_serial_noise(fitted, std)
 
 
@@ -454,21 +456,20 @@ def refine(
     """
     readings = _either(readings, mode)
     if isinstance(model, Campaign):
-        data = model.readings if data is None else data
+        data = model if data is None else data
         model = baseline(model, data, readings, prior=prior)
     elif data is None:
         raise InputError("a model without readings; valid: refine(model, readings), refine(run)")
     expect(model, Model, "model", f"{A_MODEL}, or a Campaign")
-    data = _readings(data)
+    given, kind = _readings(data), _mode(readings, data, model.cell)
     if prior is not None:
-        model = _with_prior(model, data, prior)
-    kind = _mode(readings, data, model.cell)
+        model = _with_prior(model, given, prior)
     if discover is None:
-        return refine_model(model, data, kind, background=background)
+        return refine_model(model, given, kind, background=background)
     if not Path(discover).is_dir():
         raise InputError(f"discover={str(discover)!r}: no such folder; valid: one for laws' files")
     laws = LawSearch(Path(discover))
-    refinement = refine_model(model, data, kind, laws=laws, background=background)
+    refinement = refine_model(model, given, kind, laws=laws, background=background)
     laws.write(refinement.names)
     return refinement
 
@@ -573,18 +574,39 @@ def simulate(
     return rehearsal.simulate_plan(case, bare_plan, [seed, 1])
 
 
-@contextmanager
-def view(run: Campaign | str | Path, port: int = 9877) -> Iterator[str]:
-    """Serve the story of a campaign's revision in use to rerun viewers while the block lasts.
+@dataclass(frozen=True, slots=True, eq=False)
+class Served(Brief):
+    """A story that rerun viewers can see at `url` until `close`, or until the program ends."""
+
+    url: str
+    close: Callable[[], None] = field(repr=False)
+
+    def __enter__(self) -> str:
+        """Return the address; the end of the block closes it."""
+        return self.url
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+
+def view(run: Campaign | str | Path, port: int = 9877) -> Served:
+    """Serve the story of a campaign's revision in use to rerun viewers.
 
     >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:
     ...     url
     'rerun+http://127.0.0.1:.../proxy'
+
+    Returns:
+        The address `url`, served until `close()`, the end of a `with` block, or of the program.
     """
     from hilcal.present.viewer import serve
 
-    with opened(run) as campaign, serve(build_story(campaign.chapters()), port=port) as url:
-        yield url
+    server = ExitStack()
+    with opened(run) as campaign:
+        url = server.enter_context(serve(build_story(campaign.chapters()), port=port))
+    atexit.register(server.close)
+    return Served(url, server.close)
 
 
 def _either(readings: str | None, mode: str | None) -> str | None:
@@ -594,9 +616,11 @@ def _either(readings: str | None, mode: str | None) -> str | None:
     return mode if readings is None else readings
 
 
-def _mode(kind: str | None, data: Readings, cell: Cell) -> Mode:
-    """Return the checked kind of readings; None: as the cell plans and the data allow."""
+def _mode(kind: str | None, data: Readings | Campaign, cell: Cell) -> Mode:
+    """Return the checked kind of readings; None: see `fit`."""
     if kind is None:
+        if isinstance(data, Campaign):
+            return data.mode()
         config = cell.config
         return usual_mode(data) if config is None else usual_mode(data, config.planning.readings)
     if kind not in MODES:

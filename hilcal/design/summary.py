@@ -30,7 +30,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.route import DryRun, dry_run
 from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
-from hilcal.shown import Shown, Tabular
+from hilcal.shown import Brief, Shown, Tabular
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
@@ -122,7 +122,7 @@ class CurvePoint:
 
 
 @dataclass(frozen=True, slots=True)
-class PlanSummary:
+class PlanSummary(Brief):
     """Cost, predicted precision and efficiency of a plan."""
 
     poses: int  # without the reference

@@ -49,6 +49,7 @@ from hilcal.regression.evidence import (
     score_family,
     visible,
 )
+from hilcal.shown import Brief
 from hilcal.types import Floats
 
 TRACKER_PLACE = Changeable("setup", "tracker's place", "the place of the tracker, or of the base")
@@ -214,7 +215,7 @@ class ShiftedReading:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Changes:
+class Changes(Brief):
     """The changes since an earlier campaign."""
 
     before: LaterFit  # the earlier fit at the later readings, without any change

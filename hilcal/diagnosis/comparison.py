@@ -30,7 +30,7 @@ from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, with_a
 from hilcal.identification.prediction.validation import Extrapolation, Validation, extrapolation
 from hilcal.identification.residual import error_block
 from hilcal.readings.whitening import Mode
-from hilcal.shown import Shown
+from hilcal.shown import Brief, Shown
 
 MOST_ADDED = 2
 """Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
@@ -38,7 +38,7 @@ MISFIT_LEVEL = 0.01  # p-value of χ² below which the residual exceeds the stat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ErrorToday:
+class ErrorToday(Brief):
     """The error of the earlier calibration at the later readings.
 
     z is the rms of the error in units of its covariance as the earlier fit states it: its square
@@ -90,6 +90,16 @@ class Comparison(Shown):
     today: ErrorToday
     changes: Changes
     differences: Differences | None = None
+
+    def _brief(self) -> dict[str, str]:
+        error = self.today.prediction.error
+        return {
+            "readings": f"{self.readings} later ones ({self.mode})",
+            "error": f"{1e6 * error.rms_m:.1f} µm rms, {1e6 * self.today.stated_m:.1f} µm stated",
+            "changes": ", ".join(c.candidate.name for c in self.changes.found) or "none found",
+            "error after the changes": "noise" if self.changes.explained else "more than noise",
+            "more": "today, changes, differences, to_dict()",
+        }
 
     @property
     def another_arm(self) -> bool:

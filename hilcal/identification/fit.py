@@ -35,6 +35,7 @@ Frame = Literal["sensor", "base"]
 OUTLIER_ROUNDS = 6  # most fits without gross errors, each followed by a new test; a choice
 SEED = 0  # of the random subsets of the robust start, so that equal readings give equal fits
 DRIFT_ROUNDS = 2  # most choices of a carried prior's drift, which hardly moves the linearisation
+READINGS = "Readings, as run.readings or of hc.read_table(table, cell)"
 CONFLICT_P = 1e-3  # Bonferroni-corrected p-value of a contradiction to a carried prior; a choice
 DRIFT_CHANGED = 0.1  # change of the drift, as a share of the largest, above which the fit is redone
 
@@ -171,7 +172,7 @@ class Fit(WithVarianceFactor, Tabular):
             "parameters": f"{len(self.theta)}",
             "error": f"{1e6 * self.error.rms_m:.1f} µm rms, {self.error.rms_sigma:.2f} σ",
             "chi2": f"{self.chi2:.4g} with {self.dof:.4g} degrees of freedom",
-            "more": "summary(), parameters, residuals(), to_frame(), to_dict(), predict()",
+            "more": "summary(), parameters, covariance, residuals, to_frame(), predict()",
         }
 
     @cached_property
@@ -236,10 +237,22 @@ class Fit(WithVarianceFactor, Tabular):
 
         Parameters of dropped groups are left out.
         """
-        u, shown = self.uncertainty, self.solution.estimated.copy()
+        u = self.uncertainty
+        return Estimates.of(self.model, self.theta, u.std, u.identifiable, self._shown)
+
+    @property
+    def covariance(self) -> Floats:
+        """(K, K) covariance of `parameters`, in their order; NaN where one is not determined."""
+        from hilcal.identification.parameters_document import covariance_of  # which imports this
+
+        return covariance_of(self)[np.ix_(self._shown, self._shown)]
+
+    @property
+    def _shown(self) -> Bools:
+        shown = self.solution.estimated.copy()
         for name, rows in zip(self.model.names, self.model.slices(), strict=True):
             shown[rows] &= name not in self.model.background
-        return Estimates.of(self.model, self.theta, u.std, u.identifiable, shown)
+        return shown
 
     def summary(self, details: bool = False) -> str:
         """Return the model, its errors and its parameters as plain text.
@@ -309,16 +322,13 @@ class Fit(WithVarianceFactor, Tabular):
         Raises:
             InputError: as of `predict`; or a deflection without its unloaded reading.
         """
-        expect(readings, Readings, "readings", "Readings, as of hc.read_table(table, cell)")
+        expect(readings, Readings, "readings", READINGS)
         w = whitening(readings, self.mode)
         return error_block(residual(readings, self._prediction(readings), w), w)
 
     def _prediction(self, at: States | Readings) -> Prediction:
-        expect(
-            at, (States, Readings), "at",
-            "Readings, as of hc.read_table(table, cell), or States; at joint values: "
-            "hc.Calibration.of(fit).predict(q, wrench)",
-        )  # fmt: skip
+        joints = "at joint values: hc.Calibration.of(fit).predict(q, wrench)"
+        expect(at, (States, Readings), "at", f"{READINGS}, or States; {joints}")
         states = at.states if isinstance(at, Readings) else self._checked(at)
         for e in self.model.effects:
             if e.role not in FRAME_ROLES and not e.computable(states):

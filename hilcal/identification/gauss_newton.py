@@ -39,6 +39,7 @@ from hilcal.regression.normal_equations import (
     triangle_of,
 )
 from hilcal.regression.schur import Projection, projection
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
@@ -357,7 +358,7 @@ def _line_search(problem: NewtonProblem[P], point: P, aim: Floats, chosen: Regul
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class Solution(Brief):
     """The minimum reached by Gauss-Newton."""
 
     theta: Floats  # (P,) parameters

@@ -43,6 +43,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.normal_equations import NULL_SHARE, Basis, echelon
 from hilcal.regression.schur import Projection, inverse_root
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 IDENTIFIABLE_RATIO = 0.7
@@ -57,7 +58,7 @@ DROPPED_VARIANCE = 2.0  # variance that a dropped group may have, in units of th
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Uncertainty:
+class Uncertainty(Brief):
     """Uncertainty and identifiability of the parameters."""
 
     std: Floats  # (P,) standard uncertainties; infinite where not identifiable

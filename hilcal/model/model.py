@@ -87,7 +87,8 @@ class Model(Brief):
         names = self.names
         for name in names:
             if names.count(name) > 1:
-                raise InputError(f"effect {name} is in the model already: {', '.join(names)}")
+                present = ", ".join(dict.fromkeys(names))
+                raise InputError(f"effect {name} is in the model already: {present}")
 
     def _brief(self) -> dict[str, str]:
         behind = f" and {len(self.background)} in the background" if self.background else ""

@@ -27,10 +27,11 @@ from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.plan import plan_report
 from hilcal.present.story import chapters_of, errors_by_revision
+from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement
 from hilcal.stream import StreamFit
-from hilcal.tables.table import exchange_columns
+from hilcal.tables.table import covers_with_rounding, exchange_columns
 from hilcal.tables.write import plan_csv
 
 if TYPE_CHECKING:
@@ -82,7 +83,9 @@ def frame_of(value: object) -> "pd.DataFrame":
         frame = pd.read_csv(io.StringIO(plan_csv(value.plan)), dtype=str, na_filter=False)
         return frame.astype({name: float for name in frame if name not in ("pose", "load")})
     if isinstance(value, Readings):
-        return pd.DataFrame(exchange_columns(value))
+        with_arm = value.scatter_stated or value.arm_scatter is not None
+        covers = covers_with_rounding(INSTRUMENT_AND_ARM if with_arm else INSTRUMENT, value)
+        return pd.DataFrame(exchange_columns(value, covers))
     if isinstance(value, Fit):
         return pd.DataFrame(residual_table(value))
     if isinstance(value, Compensation):

@@ -28,6 +28,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import measurement_covariance, single_covariance
 from hilcal.readings.readings import Readings, in_groups, numbered
 from hilcal.robot import se3
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 Group = tuple[Ints, Ints, Floats]  # measured (G, L), unloaded (G, U), weights (L, U)
@@ -189,7 +190,7 @@ class Bucket:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Whitening:
+class Whitening(Brief):
     """The scaled regression: from readings to stacked whitened rows."""
 
     mode: Mode  # "absolute" or "deflection"

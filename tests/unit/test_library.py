@@ -6,6 +6,7 @@ import inspect
 import json
 import pickle
 import shutil
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,7 +21,7 @@ import hilcal as hc
 from hilcal import library
 from hilcal.config import load_config
 from hilcal.config.reference import to_toml
-from hilcal.readings.covariance import INSTRUMENT_AND_ARM
+from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import configs_dir
 from hilcal.tables.table import write_table
 from studies.change import measured
@@ -132,7 +133,7 @@ def test_an_absent_viewer_is_named(site):
     code = (
         "import sys; sys.modules['rerun'] = None\nimport hilcal as hc\n"
         f"with hc.Campaign.open({str(site.run)!r}) as run:\n"
-        "    try:\n        hc.view(run).__enter__()\n"
+        "    try:\n        hc.view(run)\n"
         "    except hc.InputError as error:\n        print(error)"
     )
     done = subprocess.run(
@@ -240,10 +241,14 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
         assert run.fit(1).model.names == model.names
         assert (model + "creep" - "creep").names == model.names
         assert hc.diagnose(run).verdict == found.verdict
+        run.append(hc.fit(model, run, readings="absolute"))
+        assert hc.fit(hc.baseline(run), run).mode == hc.refine(run).fit.mode == "absolute"
     assert hc.validate(path, site.later).judged.unseen
     assert hc.report(path) == tmp_path / "run.html"
-    with hc.view(path, port=free_port) as url:
-        assert url.startswith("rerun+http")
+    served = hc.view(path, port=free_port)
+    assert served.url.startswith("rerun+http")
+    socket.create_connection(("127.0.0.1", free_port)).close()
+    served.close()
 
 
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined, planned):
@@ -252,9 +257,13 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined
         values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, fit.model, fit]
         values += [fit.parameters, fit.predict(run.readings.states), judged, judged.suspects[0]]
         calibration, q = hc.Calibration.of(fit), run.readings.states.q
-        values += [fit.residuals, planned, hc.validate(run, run), calibration]
+        values += [fit.residuals, planned, calibration]
         values += [calibration.predict(q), calibration.compensate(q)]
         values += run.revisions
+        values += [fit.solution, fit.whitening, fit.frames, fit.uncertainty, planned.summary]
+        tested, compared = hc.validate(run, run), hc.compare(run, site.later)
+        values += [tested, tested.prediction, tested.beyond, tested.shares]
+        values += [compared, compared.today, compared.changes]
         for value in (*values, found, found.steps[0]):
             text = repr(value)
             assert text.count("\n") < 15, text
@@ -293,6 +302,11 @@ def test_results_are_data_frames(site, planned, tmp_path):
         judged = hc.diagnose(fit)
         assert judged.to_frame()["effect"].tolist() == [s.effect for s in judged.suspects]
         assert fit.parameters.to_frame().index.tolist() == [p.name for p in fit.parameters]
+        for covers in (INSTRUMENT, INSTRUMENT_AND_ARM):
+            write_table(run.readings, tmp_path / "c.csv", covers)
+            once = hc.read_table(tmp_path / "c.csv", run.cell)
+            again = hc.read_table(once.to_frame(), run.cell)
+            np.testing.assert_allclose(again.covariance, once.covariance, rtol=1e-9)
     made, frame = planned, planned.to_frame()
     assert frame["pose"].tolist() == [step.pose for step in made.plan.steps]
     assert frame["load"].tolist() == [step.load for step in made.plan.steps]

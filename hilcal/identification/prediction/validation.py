@@ -25,7 +25,7 @@ from hilcal.identification.residual import ErrorBlock, error_block, noise_floor,
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings, ranges_of, turning_variables, variables
 from hilcal.readings.whitening import Mode, Whitening, whitening, whitening_matrix
-from hilcal.shown import Shown
+from hilcal.shown import Brief, Shown
 from hilcal.types import Bools, Floats, Ints
 
 STEPS = 10  # most Gauss-Newton steps of a registration; a choice
@@ -39,7 +39,7 @@ BAND = 0.95  # probability of the band that is stated, as is usual (GUM)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Validation:
+class Validation(Brief):
     """Prediction errors of readings that a model was not fitted to."""
 
     readings: Readings
@@ -194,7 +194,7 @@ class ExceededRange:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Extrapolation:
+class Extrapolation(Brief):
     """The stated errors of predictions of new readings, and which of these lie outside."""
 
     outside: Bools  # (D,) measurements that lie outside in any variable
@@ -342,7 +342,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Acceptance:
+class Acceptance(Brief):
     """All measurements, by load and by pose."""
 
     loads: tuple[Share, ...]  # in the order of the campaign's loads

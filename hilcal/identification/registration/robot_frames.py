@@ -27,6 +27,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.model.model import Model
 from hilcal.readings.readings import FULL_TURN, States
 from hilcal.robot import se3
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats
 
 TRIALS = 8  # random states at which deviations are tested for being constant; a choice
@@ -38,7 +39,7 @@ a tracker hardly measures: couplings of joints in a background are smaller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotFrames:
+class RobotFrames(Brief):
     """Base, flange and targets of a fitted model."""
 
     base: Floats  # (4, 4) T_sensor_base

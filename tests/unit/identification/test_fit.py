@@ -190,6 +190,8 @@ def test_parameters_are_those_of_the_document_and_of_the_data_frame(found):
     frame = found.parameters.to_frame()
     assert frame.index[0] == found.parameters[0].name
     assert frame.loc["joint_compliance.j2", "std"] == second.std
+    known = frame["identifiable"].to_numpy()
+    np.testing.assert_allclose(np.diag(found.covariance)[known] ** 0.5, frame["std"][known])
     with pytest.raises(InputError, match=r"did you mean .*joint_compliance.j2"):
         found.parameters["joint_complience.j2"]
 
