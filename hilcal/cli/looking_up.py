@@ -20,20 +20,19 @@ from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME, ROBOT, example_cell, example_states
 from hilcal.effects.protocol import Effect
-from hilcal.effects.written import option_defaults, option_text
+from hilcal.effects.written import option_defaults
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import with_nulls
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.campaign import section_report, sections_overview
-from hilcal.present.document import Table, note, table
+from hilcal.present.document import note, table
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file
 
 OPTIONS_NOTE = (
-    'options are given in parentheses: --effects "joint_compliance, hysteresis(joints=1-3)"; no '
-    "default: none, or one that follows from the readings."
+    'options are given in parentheses: --effects "joint_compliance, hysteresis(joints=1-3)"'
 )
 
 
@@ -53,13 +52,18 @@ def effects(
         for kind, only in zip(catalogue.effects, slides, strict=True)
     ]
     defaults = {e.name: option_defaults(type(e), e.cell, states) for e in instances}
-    out = table("effect", "law", left=(0, 1))
+    out, explained = table("effect", "law", left=(0, 1)), dict[tuple[str, str], str]()
     for e in instances:
         units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))
         needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
         count = len(e.parameters)
         facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
-        out.add(e.name, f"{e.summary}\n{facts}{_expected(e)}")
+        lines = [e.summary, f"{facts}{_expected(e)}"]
+        for option in e.option_help.items():
+            first = explained.setdefault(option, e.name)
+            meaning = option[1] if first == e.name else f"as for {first}"
+            lines.append(f"option {option[0]}: {meaning}")
+        out.add(e.name, "\n".join(lines))
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have; "
         "expected: their standard deviation before anything is measured, known to a factor of 7; "
@@ -67,8 +71,7 @@ def effects(
     ]
     for file in catalogue.files:
         notes.append(f"from {file.path}: {', '.join(e.name for e in file.effects)}")
-    options = _options_table(instances, defaults)
-    t.show([out, note("\n".join(notes)), "", options, note(OPTIONS_NOTE)])
+    t.show([out, note("\n".join([*notes, OPTIONS_NOTE]))])
     t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in instances]})
 
 
@@ -78,19 +81,6 @@ def _expected(e: Effect) -> str:
         largest[unit] = max(largest.get(unit, 0.0), std)
     sizes = ", ".join(f"{std:.1g}" + f" {unit}" * (unit != "1") for unit, std in largest.items())
     return f"; expected {sizes}" if sizes else ""
-
-
-def _options_table(instances: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
-    """Return the options of effects; an option that several effects have is explained once."""
-    out = table("effect", "option", "what it chooses", left=(0, 1, 2))
-    explained: dict[tuple[str, str], str] = {}
-    for e in instances:
-        for name, meaning in e.option_help.items():
-            first = explained.setdefault((name, meaning), e.name)
-            text = meaning if first == e.name else f"as for {first}"
-            default = option_text(defaults[e.name][name])
-            out.add(e.name, name, f"{text}\ndefault: {default}" if default else text)
-    return out
 
 
 def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> dict[str, object]:

@@ -272,7 +272,7 @@ def refine(
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
             t.show(dependence_sentence(diagnosis.misfit_breakdown))
         t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
-        if diagnosis.verdict == "unknown_effect" and laws is None:
+        if diagnosis.verdict != "adequate" and laws is None:
             in_use = o.in_use()
             same = in_use is not None and in_use.number == numbered[-1]
             _show_next_command(t, catalogue, run, None if same else numbered[-1], diagnosis)

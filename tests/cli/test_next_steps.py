@@ -201,10 +201,21 @@ def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_
     assert f"hilcal import READINGS.csv --config {CELL} -o NEW.hilcal" in " ".join(said.split())
 
 
-@pytest.mark.parametrize("name", ["diagnose", "refine"])
-def test_what_is_said_where_the_catalogue_lacks_the_effect(run, capsys, monkeypatch, name):
+DISCOVER = "hilcal discover {run} -o law.py"
+PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason", "step"),
+    [
+        ("diagnose", "no_suspect", DISCOVER),
+        ("refine", "no_suspect", DISCOVER),
+        ("refine", "background", PLAN_AFTER),
+    ],
+)
+def test_the_last_line_is_the_next_command(run, capsys, monkeypatch, name, reason, step):
     def unexplained(d):
-        return replace(d, reason="no_suspect", suspects=())
+        return replace(d, reason=reason, suspects=())
 
     def refined(*args):
         found = refine(*args)
@@ -215,10 +226,7 @@ def test_what_is_said_where_the_catalogue_lacks_the_effect(run, capsys, monkeypa
     monkeypatch.setattr("hilcal.cli.refining.judge", lambda *a: unexplained(diagnose(*a)))
     monkeypatch.setattr("hilcal.cli.refining.refine_model", refined)
     said = ok(capsys, name, run).out
-    assert said.splitlines()[-1].strip() == f"hilcal discover '{run}' -o law.py"
-
-
-PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
+    assert said.splitlines()[-1].strip() == step.format(run=f"'{run}'")
 
 
 @pytest.mark.parametrize(("reason", "words", "step"), [
