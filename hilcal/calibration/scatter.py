@@ -34,6 +34,7 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.residual import noise_floor
+from hilcal.readings.whitening import whitening
 from hilcal.robot.chain import Chain, drive_jacobian, evaluate
 from hilcal.types import Floats
 
@@ -146,12 +147,15 @@ def budget(fit: Fit) -> Budget:
     axes = fit.model.predict(used.states, fit.theta).observation.axes[fit.whitening.reading]
     read = axes @ covariance @ np.swapaxes(axes, 1, 2)  # of a distance or height, one element
     scatter = arrivals * float(np.trace(read, axis1=1, axis2=2).mean())
-    stated = noise_floor(fit.whitening.covariance) ** 2
+    # Beside an estimated scatter the fit's covariance is in units of the estimated noise.
+    stated = noise_floor(whitening(used.as_stated(), fit.mode).covariance) ** 2
+    instrument = max(stated - scatter, 0.0) if used.scatter_stated else stated
     included = used.scatter_stated or used.arm_scatter is not None
+    noise = instrument + scatter * included
     return Budget(
         parameters=float(np.sqrt(position_factor(p, fit.holdout.rms_m) * p.left_out_m2)),
-        misfit=float(np.sqrt(max(p.scatter_m2 - stated, 0.0))),
+        misfit=float(np.sqrt(max(p.scatter_m2 - noise, 0.0))),
         scatter=float(np.sqrt(scatter)),
         scatter_source=arm_scatter.source,
-        instrument=float(np.sqrt(max(stated - scatter, 0.0) if included else stated)),
+        instrument=float(np.sqrt(instrument)),
     )

@@ -283,7 +283,7 @@ def adding_lines(run: Path, plan: Path, cell: Path | None, appendable: bool) -> 
             f"hilcal run {quoted(config)} -o {quoted(run)} --append --plan {quoted(plan)}",
         )
     return (
-        "Export, append its readings (new pose names), import:",
+        "Export, add the new readings as rows (new pose names), import:",
         f"hilcal export {quoted(run)} --readings READINGS.csv",
         f"hilcal import READINGS.csv --config {quoted(config)} -o NEW.hilcal",
     )

@@ -9,8 +9,10 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
 from hilcal.diagnosis.noise import RP_PER_RMS
+from hilcal.identification.noise.arm_scatter import with_arm_scatter
 from hilcal.identification.noise.full_covariance import joint_factors
-from hilcal.readings.readings import Readings
+from hilcal.identification.residual import noise_floor
+from hilcal.readings.readings import ArmScatter, Readings
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import fitted_model
 from tests.support.observer_cases import base_cell, observed, stated
@@ -76,6 +78,15 @@ def test_the_budget_is_never_below_what_poses_left_out_show(mode, poses):
     found = fitted(c, mode, c.readings)
     assert budget(found).combined >= found.holdout.rms_m * (1 - 1e-9)
     assert found.holdout.rms_m > found.error.rms_m
+
+
+def test_the_instrument_is_as_stated_beside_a_scatter_in_units_of_its_noise():
+    c = campaign(poses=16)
+    alone = instrument(c)
+    scatter = ArmScatter("joints", (TRUE,), (1e-6,), 2e-5, 0.0, 0.3, unit=0.3)
+    found = fitted(c, "absolute", with_arm_scatter(c.cell, alone, scatter))
+    b = budget(found)
+    assert b.instrument == pytest.approx(noise_floor(alone.covariance), rel=0.02)
 
 
 def test_identical_rows_are_no_repeats():
