@@ -197,7 +197,8 @@ def errors(fit: Fit) -> Table:
     """Return the table of errors: nominal arm, fitted poses, poses left out, noise alone."""
     rows = {"before: rigid nominal arm": nominal_error(fit)}
     rows |= {"poses fitted": fit.error, "poses left out": fit.holdout}
-    return _errors(rows, full_prediction(fit).noise_floor, error_words(fit.readings))
+    p = full_prediction(fit)
+    return _errors(rows, p.noise_floor, error_words(fit.readings), p.noise_factor)
 
 
 def error_words(readings: Readings) -> str:
@@ -206,12 +207,15 @@ def error_words(readings: Readings) -> str:
 
 
 def _errors(
-    blocks: Mapping[str, ErrorBlock], floor_m: float, head: str = "3-D position error"
+    blocks: Mapping[str, ErrorBlock],
+    floor_m: float,
+    head: str = "3-D position error",
+    floor_sigma: float = 1.0,
 ) -> Table:
     out = table(head, "rms", "mean", "largest", "rms in σ")
     for name, e in blocks.items():
         out.add(name, *map(length, (e.rms_m, e.mean_m, e.max_m)), f"{e.rms_sigma:.2f}")
-    out.add("noise alone", length(floor_m), "", "", "1.00")
+    out.add("noise alone", length(floor_m), "", "", f"{floor_sigma:.2f}")
     return out
 
 

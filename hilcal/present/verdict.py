@@ -498,8 +498,11 @@ def _implausible_scatter(s: ArmScatter, arm: Arm) -> str:
 def _spread(d: Diagnosis) -> str:
     noise = "stated" if d.fit.readings.noise_stated else "estimated"
     scatter = d.fit.readings.arm_scatter
-    with_it = f" with the arm's scatter of {length(scatter.size_m)} rms" if scatter else ""
-    return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise{with_it}"
+    times = f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise"
+    if scatter is None:
+        return times
+    joined = "with" if scatter.unit == 1.0 else "of the instrument, beside"
+    return f"{times} {joined} the arm's scatter of {length(scatter.size_m)} rms"
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> list[str]:

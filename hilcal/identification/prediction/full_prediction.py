@@ -57,9 +57,18 @@ class FullPrediction:
         return mahalanobis2(self.raw, self.whitening.covariance)
 
     @property
+    def noise_factor(self) -> float:
+        """Standard deviation of the noise in units of the covariance.
+
+        1, or that of the instrument's noise beside which the arm's scatter was estimated.
+        """
+        scatter = self.readings.arm_scatter
+        return 1.0 if scatter is None else scatter.unit
+
+    @property
     def noise_floor(self) -> float:
-        """Root mean square of the 3-D position error under the stated noise alone, m."""
-        return noise_floor(self.whitening.covariance)
+        """Root mean square of the 3-D position error under noise alone, m."""
+        return self.noise_factor * noise_floor(self.whitening.covariance)
 
     def name(self, measurement: int) -> tuple[str, str]:
         """Pose and load of a measurement."""

@@ -376,14 +376,15 @@ def _variances_of_random(
     """Variances of a model's random effects; None without any, or where they count as known."""
     if model.background:
         return mixed_fit_at(model, fitted, mode, theta)
-    if not model.random or fitted.value.size > MOST_ROWS:
+    lines = {e.name for e in model.effects if e.groups() is not None}
+    shrunk = lines | set(model.random)
+    if not shrunk or fitted.value.size > MOST_ROWS:
         return None
     # As `with_shrunk_effects` fits them, with the arm's scatter in the covariance. Flat effects
     # have the prior of C: where the readings leave one open, no variance moves it without limit.
-    lines = {e.name for e in model.effects if e.groups() is not None and e.name in model.random}
     magnitude = ordinary_magnitudes(model, theta)
     parts = zip(model.effects, model.slices(), strict=True)
-    known = {e.name: magnitude[rows] for e, rows in parts if e.name not in model.random}
+    known = {e.name: magnitude[rows] for e, rows in parts if e.name not in shrunk}
     families = families_of(model, lines=lines, known=known)
     return mixed_fit_at(model, replace(fitted, scatter_stated=True), mode, theta, families)
 

@@ -221,7 +221,7 @@ def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
         text = f"rms; {uncorrected} without correction; {error['count']} points"
         yield "Measured at corrected targets", corrected, text
     yield card("After, poses left out", m.fit.holdout)
-    yield "Noise alone", length(m.story.noise_floor_m), "rms that the stated noise would leave"
+    yield "Noise alone", length(m.story.noise_floor_m), "rms that noise alone would leave"
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
