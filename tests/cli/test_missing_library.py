@@ -62,6 +62,7 @@ with hc.Campaign.open("bare.hilcal") as run:
 """
 
 
+@pytest.mark.long
 def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folder):
     ended = without(BARE, folder, code=WORK.format(cell=CELL))
     assert (ended.returncode, "error" in ended.stderr) == (0, False), ended.stderr

@@ -187,6 +187,7 @@ def test_what_a_diagnosis_says(fitted, capsys):
     follow(capsys, said, f"hilcal add '{fitted}' hysteresis --revision 1")
 
 
+@pytest.mark.long
 def test_what_a_diagnosis_says_of_a_background(fitted, capsys, monkeypatch, tmp_path):
     def judged(*args):
         return replace(diagnose(*args), reason="background", suspects=())

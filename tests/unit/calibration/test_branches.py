@@ -1,6 +1,7 @@
 """A waypoint is corrected only on the branch on which the controller reaches it."""
 
 import numpy as np
+import pytest
 
 from hilcal.calibration.compensation import invert
 from hilcal.calibration.points import Points, on_branch
@@ -76,6 +77,7 @@ def test_near_to_two_branches_is_uncertain():
     assert told(f"movel({pose(A)})", near=A + 0.1)[0] == [""]
 
 
+@pytest.mark.long
 def test_what_is_certain_is_the_nearest_of_all_solutions():
     """Of 60 such cases, Newton's method from there finds another solution in the last two."""
     cases = np.random.default_rng(0).normal(size=(60, 2, 6)) * [[0.4], [0.5]]

@@ -346,6 +346,7 @@ def met(seeds):
     return [seen, left, refused]
 
 
+@pytest.mark.long
 def test_every_target_of_a_random_program_is_corrected_or_left():
     """Corrected, left and refused ones are all met often, so that the property says something."""
     assert min(np.array(met(range(80))) / [10, 20, 3]) >= 1

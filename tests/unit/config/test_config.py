@@ -146,6 +146,7 @@ LOAD_NAME = st.text(min_size=1).filter(lambda name: escaped(name) == name)
     joint_std=st.floats(0, 1e-3) | st.tuples(*[st.floats(0, 1e-3)] * 6),
     base=st.none() | st.tuples(vector, vector),
 )
+@pytest.mark.long
 def test_json_round_trip(target, mass, loads, joint_std, base):
     tracker = {} if base is None else {"base_xyz_m": base[0], "base_rotvec_rad": base[1]}
     config = CellConfig.model_validate(

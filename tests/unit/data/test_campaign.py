@@ -442,6 +442,7 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder
 
 
 @needs_gcc
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("batches", "tries", "least"), [(3, 2, 50), pytest.param(6, 30, 1000, marks=pytest.mark.slow)]
 )

@@ -193,6 +193,7 @@ def test_one_suspect_is_refused(suspects):
         plan_separating(first.rehearsal.cell.with_config(SMALL), *asked)
 
 
+@pytest.mark.long
 def test_what_was_ambiguous_is_decided():
     first = doubtful("base_compliance", 2)
     assert "base_compliance" in first.suspects

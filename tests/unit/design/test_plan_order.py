@@ -208,6 +208,7 @@ def test_orders_under_different_loads_are_independent():
     assert after < 0.5 * before
 
 
+@pytest.mark.long
 def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
     _, made = _large()
     ordered = made[0]

@@ -73,7 +73,7 @@ def test_without_a_change_nothing_is_claimed(arm, seed):
     )
 
 
-@pytest.mark.parametrize("changed", [False, True])
+@pytest.mark.parametrize("changed", first(1, [False, True]))
 def test_a_gross_error_is_no_change_and_hides_none(arm, changed):
     found = later(arm, zero(5, -1.5e-3) if changed else lambda p: p, 13, count=20, off=6)
     (gross,) = found.gross
@@ -83,6 +83,7 @@ def test_a_gross_error_is_no_change_and_hides_none(arm, changed):
     assert found.explained
 
 
+@pytest.mark.long
 def test_a_joints_new_zero_and_compliance_are_found_with_their_size(arm):
     true = arm.world.physics.joint_compliance[1]
     found = later(arm, lambda p: softer(2, 2.0)(zero(5, -1.5e-3)(p)), 11)
@@ -95,6 +96,7 @@ def test_a_joints_new_zero_and_compliance_are_found_with_their_size(arm):
     assert found.explained
 
 
+@pytest.mark.long
 def test_a_zero_of_joint_1_is_the_trackers_new_place_unless_that_is_the_old_one(arm):
     anew = later(arm, zero(1, 2e-3), 12)
     assert anew.found == ()

@@ -74,6 +74,7 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
     assert 0.2 < np.sqrt(np.mean(np.square(off))) < 1.2
 
 
+@pytest.mark.long
 def test_nothing_is_told_before_there_are_poses_to_learn_from():
     judged = [j for j, _, _ in told(0)[:7]]
     assert judged == [LiveResidual()] * len(judged)

@@ -85,7 +85,7 @@ def test_readings_without_a_step_show_none():
     assert step_in_order(fitted_model(C.cell, C.readings, "absolute")) is None
 
 
-@pytest.mark.parametrize("settling", [None, 0.3, 0.12])
+@pytest.mark.parametrize("settling", first(1, [None, 0.3, 0.12]))
 def test_a_drift_is_no_step(settling):
     value = C.readings.value.copy()
     time = np.linspace(0.0, 1.0, len(value))
@@ -94,6 +94,7 @@ def test_a_drift_is_no_step(settling):
     assert step_in_order(fitted_model(C.cell, drifting, "absolute")) is None
 
 
+@pytest.mark.long
 def test_a_step_that_explains_less_than_the_state_is_not_named(monkeypatch):
     """A few readings at the beginning may be shifted by chance, where a law is missing."""
     c = campaign(plan_seed=0, poses=30, registration_known=True)

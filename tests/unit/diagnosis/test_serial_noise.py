@@ -48,6 +48,7 @@ def test_white_noise_is_left_as_it_is(mode):
 
 
 @pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
+@pytest.mark.long
 def test_nothing_is_named_for_it_and_it_is_said(mode):
     cell, readings = campaign(0.9, mode, 3)
     found = refined(cell, readings, mode)
@@ -91,6 +92,7 @@ def test_a_fit_with_it_is_found_again():
     np.testing.assert_allclose(again.uncertainty.std, found.uncertainty.std, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_what_effects_explain_as_well_is_in_doubt():
     found = with_serial_noise(fitted_model(*campaign(0.9), "absolute"))
     serial = found.readings.serial

@@ -122,7 +122,7 @@ def test_effects_are_no_wrong_figures(effect):
     assert d.suspects[0].effect == effect, message(d)
 
 
-@pytest.mark.parametrize(("poses", "seed"), [(10, 0), (12, 2), (12, 13)])
+@pytest.mark.parametrize(("poses", "seed"), first(1, [(10, 0), (12, 2), (12, 13)]))
 def test_an_impossible_tool_does_not_explain_few_readings(poses, seed):
     """It did, with a centre of mass metres away, in 20 of 20 such campaigns of 10 poses."""
     hidden = ("link_geometry", "transmission_error")

@@ -58,6 +58,7 @@ def found():
     return discover(campaign(LAW), name="bent")
 
 
+@pytest.mark.long
 def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
     law = found().laws[0]
     assert found().reason == "law"

@@ -96,6 +96,7 @@ def unknown():
     return diagnose(fitted_model(c.cell, c.readings, c.mode))
 
 
+@pytest.mark.long
 def test_an_unknown_effect_has_a_curve_in_units_for_people():
     d = unknown()
     r = build_story([Chapter(1, None, d.fit, d)]).revisions[0]

@@ -149,6 +149,7 @@ def test_the_error_falls_as_far_as_predicted(done):
     assert found.left_out == ()
 
 
+@pytest.mark.long
 def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_path, capsys):
     """Alone "94 % are removed" would be said, beside bands that none of its points keeps."""
     d = drawn_calibration(

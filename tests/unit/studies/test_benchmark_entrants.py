@@ -108,6 +108,7 @@ def fakes(tmp_path):
     return tmp_path / "home"
 
 
+@pytest.mark.long
 def test_the_runner_survives_whatever_entrants_do(tmp_path, fakes):
     words = ("--tasks", first_task("elastic").name, "--limit", "3", "--jobs", "2")
     assert run(tmp_path, str(TASKS), *words, home=fakes) == 0

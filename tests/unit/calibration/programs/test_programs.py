@@ -250,6 +250,7 @@ def test_offs_and_reltool_move_as_abb_defines_them():
 
 
 @pytest.mark.parametrize("maker", first(1, list(EXAMPLE)))
+@pytest.mark.long
 def test_flags_tell_every_branch_and_turn(maker, arms):
     arm, language = arms[maker], EXAMPLE[maker].language
     assert form_mismatch(arm, language) == ""
