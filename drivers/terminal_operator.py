@@ -127,10 +127,10 @@ def _why_nobody() -> str:
     try:
         if not sys.stdin.isatty():
             return _NO_TERMINAL
-        seen = sys.stderr.isatty() or stat.S_ISFIFO(os.fstat(sys.stderr.fileno()).st_mode)
+        visible = sys.stderr.isatty() or stat.S_ISFIFO(os.fstat(sys.stderr.fileno()).st_mode)
     except (AttributeError, OSError, ValueError):  # no such stream, or a closed one
         return _NO_TERMINAL
-    return "" if seen else _UNSEEN
+    return "" if visible else _UNSEEN
 
 
 def _numbers(values: tuple[float, float, float]) -> str:

@@ -211,7 +211,7 @@ def fit_stream(
 
 
 def bootstrap(
-    found: Fit,
+    fit: Fit,
     draws: int = bootstraps.DRAWS,
     *,
     seed: int = 0,
@@ -233,7 +233,7 @@ def bootstrap(
         scheduler: address of a Dask cluster to use instead.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
-        return bootstraps.bootstrap(found, engine, draws, seed)
+        return bootstraps.bootstrap(fit, engine, draws, seed)
 
 
 @with_one_blas_thread

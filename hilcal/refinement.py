@@ -185,23 +185,23 @@ def refine(
     Raises:
         InputError: too many readings.
     """
-    found = _refine(model, readings, mode, say, history, laws, on_step, background)
-    agrees = found.diagnosis.residual_is_noise and not found.fit.contradictions
-    if found.fit.model.prior is None or agrees:
-        return found
+    refinement = _refine(model, readings, mode, say, history, laws, on_step, background)
+    agrees = refinement.diagnosis.residual_is_noise and not refinement.fit.contradictions
+    if refinement.fit.model.prior is None or agrees:
+        return refinement
     say("refining without the prior, which does not explain the readings")
     try:
-        start = _without_prior(found.steps[0].fit, readings)
+        start = _without_prior(refinement.steps[0].fit, readings)
         alone = _refine(start, readings, mode, say, NO_HISTORY, laws, lambda step: None, background)
     except CannotAnswerError:  # the readings alone are too few
-        return found
-    if not improves(*left_out_squares(found.fit, alone.fit)):
-        return found
+        return refinement
+    if not improves(*left_out_squares(refinement.fit, alone.fit)):
+        return refinement
     say("without the prior poses left out are predicted better")
     steps = (replace(alone.steps[0], removed=PRIOR), *alone.steps[1:])
     for step in steps:
         on_step(step)
-    return Refinement((*found.steps, *steps))
+    return Refinement((*refinement.steps, *steps))
 
 
 def _without_prior(fitted: Fit, readings: Readings) -> Model:

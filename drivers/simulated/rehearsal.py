@@ -42,8 +42,8 @@ def choices() -> tuple[str, ...]:
 def user_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """User's effects that can be hidden; see `user_effect`."""
     effects = () if catalogue is None else catalogue.with_role("effect")
-    own = (k for k in effects if k not in BUILT_IN)
-    return tuple(k.name for k in own if k.name not in injected.ALL_EFFECTS)
+    others = (k for k in effects if k not in BUILT_IN)
+    return tuple(k.name for k in others if k.name not in injected.ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:

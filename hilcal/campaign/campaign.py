@@ -405,19 +405,19 @@ class Campaign(Brief):
         chain = () if record is None else revisions.chain(self.file.revisions(), record.number)
         return revisions.history(chain)
 
-    def append(self, found: Fit | Diagnosis | Refinement) -> int:
+    def append(self, result: Fit | Diagnosis | Refinement) -> int:
         """Append a fit, a diagnosed fit, or all steps of a refinement as revisions.
 
         Return the number of the (last) revision. Nothing is stored where the latest revisions are
         these already. Raises as `store` does.
         """
-        if isinstance(found, Refinement):
-            records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
-        elif isinstance(found, Diagnosis):
-            records = [self.record(found.fit, found)]
+        if isinstance(result, Refinement):
+            records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in result.steps]
+        elif isinstance(result, Diagnosis):
+            records = [self.record(result.fit, result)]
         else:
-            expect(found, Fit, "found", "a Fit, a Diagnosis or a Refinement")
-            records = [self.record(found)]
+            expect(result, Fit, "result", "a Fit, a Diagnosis or a Refinement")
+            records = [self.record(result)]
         return self.append_records(records)[-1]
 
     def append_records(
@@ -442,7 +442,7 @@ class Campaign(Brief):
 
     def store(
         self,
-        found: Fit,
+        fitted: Fit,
         diagnosis: Diagnosis | None = None,
         added: str | None = None,
         removed: str | None = None,
@@ -457,11 +457,11 @@ class Campaign(Brief):
             InputError: it was fitted to other readings than those of this campaign, or these are
                 of a validation campaign (`store.procedure_log`).
         """
-        return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
+        return self.file.append_revision(self.record(fitted, diagnosis, added, removed, parent))
 
     def record(
         self,
-        found: Fit,
+        fitted: Fit,
         diagnosis: Diagnosis | None = None,
         added: str | None = None,
         removed: str | None = None,
@@ -469,11 +469,11 @@ class Campaign(Brief):
     ) -> RevisionRecord:
         """Return the record that `store` stores; raises as `store` does."""
         refuse_fitting(self.file)
-        hashed = content_hash(found.readings)
+        hashed = content_hash(fitted.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else diagnosis.to_dict()
-        record = revisions.to_record(found, document, added, hashed, removed, parent)
+        record = revisions.to_record(fitted, document, added, hashed, removed, parent)
         options = {**record.options, STORED_HASH: self.data_hash, **running_command()}
         if self.changes:
             options[CELL] = self.changes

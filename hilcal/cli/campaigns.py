@@ -121,8 +121,8 @@ def _one_file(tables: list[Path]) -> Path:
     if len(tables) == 1 and not tables[0].is_dir():
         return tables[0]
     if tables[0].is_dir():
-        found = sorted(path.suffix for path in tables[0].iterdir() if path.is_file())
-        of = [f"{quoted(tables[0])}/*{found[0] if found else '.csv'}"]
+        suffixes = sorted(path.suffix for path in tables[0].iterdir() if path.is_file())
+        of = [f"{quoted(tables[0])}/*{suffixes[0] if suffixes else '.csv'}"]
         said = f"{tables[0]}: a folder"
     else:
         of, said = [quoted(path) for path in tables], f"{len(tables)} files"

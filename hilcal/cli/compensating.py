@@ -258,8 +258,8 @@ def _not_allowed(cell: Cell, names: Sequence[str], q: Floats, loads: Sequence[st
     if not bad.any():
         return ""
     k = int(np.argmax(bad))
-    found = (v.line(names[k]) for v in limits.findings(q[k][None], loads[k], kinds))
-    why = next(iter((*found, *limits.unbearable(loads[k]).values())))
+    findings = (v.line(names[k]) for v in limits.findings(q[k][None], loads[k], kinds))
+    why = next(iter((*findings, *limits.unbearable(loads[k]).values())))
     more = f" (and {bad.sum() - 1} more points)" if bad.sum() > 1 else ""
     return f"the cell of the campaign does not allow {why}{more}"
 

@@ -249,11 +249,11 @@ def refine(
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(gross_error_lines(refinement.fit, details))
-        found = set(refinement.fit.model.named) - set(model.names)
+        added = set(refinement.fit.model.named) - set(model.names)
         if details:
-            t.show(fit_words.parameters(refinement.fit, effects=found))
+            t.show(fit_words.parameters(refinement.fit, effects=added))
         else:
-            t.show([*fit_words.strongest_parameters(refinement.fit, found), ""])
+            t.show([*fit_words.strongest_parameters(refinement.fit, added), ""])
         t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")

@@ -96,11 +96,11 @@ def step_in_order(fit: Fit) -> OrderStep | None:
             readings.m,
         )  # fmt: skip
         units, kinds = shift_rows(model, readings, fit.mode), _displacements(moves)
-        found, _ = _best_steps(e, units, kinds)
-        joint = next(f.kind for f in found if f.kind not in (SENSOR, TARGET))
+        steps, _ = _best_steps(e, units, kinds)
+        joint = next(f.kind for f in steps if f.kind not in (SENSOR, TARGET))
         freed = [
             estimate_variances(linearised_problem(model, without, fit.mode, theta), start).equations
-            for f in found
+            for f in steps
             if f.kind in (SENSOR, TARGET, joint)
             for without in [replace(readings, value=readings.value - f.shift(kinds))]
         ]
@@ -109,8 +109,8 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         e = equations(problem, with_step.log_std)
     except (CannotAnswerError, np.linalg.LinAlgError):
         return None
-    found, drift = _best_steps(e, units, kinds)
-    best, serial = found[0], fit.readings.serial
+    steps, drift = _best_steps(e, units, kinds)
+    best, serial = steps[0], fit.readings.serial
     if serial is not None:
         drift = max(drift, 2 * serial.log_likelihood_ratio)
     p_value = max(best.p_value, best.p_value_of(gain))
@@ -120,7 +120,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
     remaining = float(e.target @ e.residual)
     return OrderStep(
         moved=tuple(
-            f.kind for f in found if f.p_value < LEVEL and best.score - f.score < 2 * SAME_EVIDENCE
+            f.kind for f in steps if f.p_value < LEVEL and best.score - f.score < 2 * SAME_EVIDENCE
         ),
         first=int(rows[best.first]),
         previous=int(rows[best.first - 1]),
@@ -173,7 +173,7 @@ def _displacements(moves: ReadingDerivative) -> dict[str, Floats]:
 
 def _best_steps(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[list[_Step], float]:
     """Return the best step of each kind, best first, and the score of the best drift."""
-    found, drift = [], 0.0
+    best, drift = list[_Step](), 0.0
     freedom = np.count_nonzero(units.any(axis=(1, 2))) - float(e.spent.sum()) - e.problem.flat
     for kind, columns in kinds.items():
         drifts, steps = _gains(e, np.einsum("rnm,nmq->rnq", units, columns))
@@ -184,8 +184,8 @@ def _best_steps(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[
         alike = 1 if kind in (SENSOR, TARGET) else len(kinds) - 2
         tests, score = 2 * alike * len(steps), ratio - 2 * rank
         step = _Step(kind, FEWEST_IN_RUN + k, gain, score, rank, freedom, tests, displacement)
-        found.append(step)
-    return sorted(found, key=lambda f: -f.score), drift
+        best.append(step)
+    return sorted(best, key=lambda f: -f.score), drift
 
 
 def _likelihood_ratio(gain: float, freedom: float) -> float:

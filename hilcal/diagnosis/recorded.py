@@ -113,7 +113,7 @@ def place_variables(p: Linearisation) -> Iterator[StateVariable]:
     flange, gravity = s.situation.chain.rotation[-1], s.situation.cell.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     place = s.observation.base_position
-    found = [
+    variables = [
         *_along_flange("gravity", flange.swapaxes(1, 2) @ down),
         StateVariable("target along base x", "m", "place", place[:, 0]),
         StateVariable("target along base y", "m", "place", place[:, 1]),
@@ -123,9 +123,9 @@ def place_variables(p: Linearisation) -> Iterator[StateVariable]:
     if (sight := _sight(s.observation)) is not None:
         axes = s.observation.axes @ flange
         distance = np.linalg.norm(s.observation.position, axis=1)
-        found += _along_flange("sight", np.einsum("nik,ni->nk", axes, sight))
-        found.append(StateVariable("distance from the sensor's origin", "m", "place", distance))
-    yield from (v for v in found if _varies(v.values))
+        variables += _along_flange("sight", np.einsum("nik,ni->nk", axes, sight))
+        variables.append(StateVariable("distance from the sensor's origin", "m", "place", distance))
+    yield from (v for v in variables if _varies(v.values))
 
 
 def _along_flange(kind: str, direction: Floats) -> list[StateVariable]:

@@ -146,12 +146,12 @@ def with_unconfirmed_suspect(d: Diagnosis) -> Diagnosis:
     """
     if d.reason != "no_suspect" or d.fit.model.background:
         return d
-    found = d.unconfirmed
-    if not found or d.predictable_share > max(s.holdout_share for s in found):
+    unconfirmed = d.unconfirmed
+    if not unconfirmed or d.predictable_share > max(s.holdout_share for s in unconfirmed):
         return d
-    first = found[0].effect
+    first = unconfirmed[0].effect
     others = [s for s in d.suspects if s.effect != first]
-    return replace(d, reason="unconfirmed_suspect", suspects=(found[0], *others))
+    return replace(d, reason="unconfirmed_suspect", suspects=(unconfirmed[0], *others))
 
 
 def with_order_step(d: Diagnosis) -> Diagnosis:
@@ -284,30 +284,30 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         passing = [s.effect for s in suspects if s.passes]
         suspects, lead = ranked(suspects, {*history.rejected, *passing}), None
     if lead is None:
-        found = _without_suspect(e, suspects, added)
+        finding = _without_suspect(e, suspects, added)
     else:
-        found = _with_suspect(e, suspects, lead, whole_catalogue)
-    alone, reason = None, found.reason
+        finding = _with_suspect(e, suspects, lead, whole_catalogue)
+    alone, reason = None, finding.reason
     unexplained = reason in ("misjudged_noise", "no_suspect") and e.misfit
-    if unexplained and not _predicted(e, found.regression):
+    if unexplained and not _predicted(e, finding.regression):
         alone = e.pose_alone
         reason = reason if alone is None else "pose_alone"
     return Diagnosis(
         fit=e.fit,
         history=history,
         reason=reason,
-        suspects=found.suspects,
+        suspects=finding.suspects,
         misfit_breakdown=e.misfit_breakdown,
-        predictable_share=found.predicted,
-        dependences=found.regression.dependences,
-        follows=found.follows[:MOST_NAMED],
+        predictable_share=finding.predicted,
+        dependences=finding.regression.dependences,
+        follows=finding.follows[:MOST_NAMED],
         pure_error=e.pure_error,
-        noise=found.noise,
+        noise=finding.noise,
         redundant=e.redundant,
-        separability=found.rivals,
-        insufficiency=found.insufficiency,
+        separability=finding.rivals,
+        insufficiency=finding.insufficiency,
         alternatives=e.alternatives(added),
-        scatter=found.scatter,
+        scatter=finding.scatter,
         pose_alone=alone,
         background=e.background,
         confounded=e.confounded(None if lead is None else lead.effect),

@@ -243,10 +243,10 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
         if figure.mistaken(change) and _possible(wrong, fit) and predicts_better(fit, refit):
             named.append((bic, wrong))
     named.sort(key=lambda pair: pair[0])
-    found = tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
+    figures = tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
     passing = [s for s in suspects if s.passes]
-    if found or any(s.share > LEAST_SHARE for s in passing):
-        return found
+    if figures or any(s.share > LEAST_SHARE for s in passing):
+        return figures
     best = min((s.score.delta_bic for s in passing), default=0.0)
     return _wrong_direction(fit, LEAST_SHARE if passing else LEAST_SHARE_OF_GRAVITY, best)
 

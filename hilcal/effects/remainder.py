@@ -85,10 +85,10 @@ class Remainder(Effect):
         n = self.cell.arm.n
         usual = [f"{j}:{i}" for j in range(1, n + 1) for i in range(1, n + 1) if i != j]
         text = self.options.get("laws", "/".join(usual) or "base:1")
-        found = [_LAW.fullmatch(t.strip()) for t in text.split("/")] if type(text) is str else []
-        laws = [(m[1], m[2]) for m in found if m]
+        matches = [_LAW.fullmatch(t.strip()) for t in text.split("/")] if type(text) is str else []
+        laws = [(m[1], m[2]) for m in matches if m]
         numbers = [int(k) for law in laws for name in law for k in re.findall("[0-9]+", name)]
-        known = len(found) == len(laws) == len({*laws}) > 0 and all(1 <= k <= n for k in numbers)
+        known = len(matches) == len(laws) == len({*laws}) > 0 and all(1 <= k <= n for k in numbers)
         if not known:
             raise InputError(
                 f"effect {self.name}: laws = {text!r}; valid: pairs of what errs (joints 1 to {n}, "

@@ -431,18 +431,18 @@ def fit(
         InputError: a deflection without its unloaded reading, or too many readings.
     """
     limits.check_fitted(len(readings), readings.m)
-    found = _fit(model, readings, mode, scaling, start, prior, outlier)
-    carried = found.model.prior
+    fitted = _fit(model, readings, mode, scaling, start, prior, outlier)
+    carried = fitted.model.prior
     if carried is None or prior is not None or carried.relation != "arm" or scaling != "gc":
-        return found
-    if not found.contradictions:
-        return found
+        return fitted
+    if not fitted.contradictions:
+        return fitted
     another = replace(model, prior=carried.of_another_arm(model.catalogue))
-    other = _fit(another, readings, mode, scaling, found.theta, None, found.outlier)
-    same = found.model, found.solution
-    if not of_another_arm(same, (other.model, other.solution), found.whitening):
-        return found
-    if not found.outlier.any():
+    other = _fit(another, readings, mode, scaling, fitted.theta, None, fitted.outlier)
+    same = fitted.model, fitted.solution
+    if not of_another_arm(same, (other.model, other.solution), fitted.whitening):
+        return fitted
+    if not fitted.outlier.any():
         return other
     return _fit(another, readings, mode, scaling, other.theta, None, outlier)
 

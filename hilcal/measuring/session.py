@@ -239,12 +239,12 @@ class Session:
         for stop in start:
             self._watched(partial(self._move, stop))
             with suppress(TargetLostError):  # a reading will search it again
-                seen = self._target_position(stop)
+                measured = self._target_position(stop)
                 # of several targets it is not known which one was measured
-                if self._cell.targets is None and self._compare_place(stop.name, seen):
-                    seen = self._target_position(stop)  # put back, or agreed to
-                    self._state.references.append(seen)
-                positions.append((stop.q, seen))
+                if self._cell.targets is None and self._compare_place(stop.name, measured):
+                    measured = self._target_position(stop)  # put back, or agreed to
+                    self._state.references.append(measured)
+                positions.append((stop.q, measured))
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
                 raise DeviceError(wrong)

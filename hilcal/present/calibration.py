@@ -490,11 +490,11 @@ def shares_report(test: validation.Acceptance) -> Iterator[Block]:
     size, a, worst = length(test.limit_m), test.everything, test.poses[0]
     largest = f"the largest error is {length(a.max_m)}, at {_place(worst)}"
     poses = sum(not s.passes(test.limit_m) for s in test.poses)
-    found = f"FAILED: {test.over} of {a.count} errors are over the limit of {size}"
-    found += f", at {poses} of {len(test.poses)} poses"
+    result = f"FAILED: {test.over} of {a.count} errors are over the limit of {size}"
+    result += f", at {poses} of {len(test.poses)} poses"
     if test.passed:
-        found = f"PASSED: no error is over the limit of {size}"
-    yield f"{found}; {largest}.\n"
+        result = f"PASSED: no error is over the limit of {size}"
+    yield f"{result}; {largest}.\n"
 
 
 def loads_report(test: validation.Acceptance) -> Iterator[Block]:

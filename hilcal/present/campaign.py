@@ -124,12 +124,12 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
             out.add("", "", "!", problem)
     if answers:
         yield from ("", out, "")
-    count, found = sum(len(a.problems) for a in answers), "All devices are ready"
+    count, result = sum(len(a.problems) for a in answers), "All devices are ready"
     if not answers:
-        found = "The cell does not name all its devices: none was asked"
+        result = "The cell does not name all its devices: none was asked"
     elif count:
-        found = f"{count} problem{'s' * (count > 1)}"
-    yield f"{found}. Nothing was moved."
+        result = f"{count} problem{'s' * (count > 1)}"
+    yield f"{result}. Nothing was moved."
     if dry is None:
         return
     if dry.problems:

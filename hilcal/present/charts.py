@@ -323,9 +323,9 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
         points = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
         traces.append(marks(*points, name=f"base {axis}", text=text, hovertemplate=hover))
     measure = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
-    known, found = x[story.fitted], y[story.fitted]
-    total = np.sum((found - found.mean(axis=0)) ** 2)
-    share = 100 * (1 - np.sum((found - known) ** 2) / total) if total > 0 else 0.0
+    predicted, measured = x[story.fitted], y[story.fitted]
+    total = np.sum((measured - measured.mean(axis=0)) ** 2)
+    share = 100 * (1 - np.sum((measured - predicted) ** 2) / total) if total > 0 else 0.0
     part = f"{share:.1f} %" if share > 0 else "none"
     says = (
         f"Measured against predicted {measure}: the model accounts for {part} of what was "

@@ -41,10 +41,10 @@ def significant_waves(
 
     Each round fits the waves of all previous ones together, and searches what is left.
     """
-    found: list[tuple[int, int]] = []
+    lines: list[tuple[int, int]] = []
     remaining = residual
     for _ in range(ROUNDS):
-        free = max(dof - 2.0 * len(found), 3.0)
+        free = max(dof - 2.0 * len(lines), 3.0)
         total = float(np.sum(remaining**2))
         square, best = total / free, []
         for j in range(angle.shape[1]):
@@ -55,16 +55,16 @@ def significant_waves(
             p = scipy.stats.f.sf(f, 2, free - 2) * len(orders) * angle.shape[1]
             if p < level and gain[k] > LEAST_SHARE * total:
                 best.append((float(gain[k]), j, int(orders[k])))
-        new = [(j, k) for _, j, k in sorted(best, reverse=True) if (j, k) not in found]
+        new = [(j, k) for _, j, k in sorted(best, reverse=True) if (j, k) not in lines]
         if not new:
             break
-        found += new
-        waves = [w(k * angle[:, j]) for j, k in found for w in (np.cos, np.sin)]
-        joints = np.repeat([j for j, _ in found], 2)
+        lines += new
+        waves = [w(k * angle[:, j]) for j, k in lines for w in (np.cos, np.sin)]
+        joints = np.repeat([j for j, _ in lines], 2)
         x = (moved[:, :, joints] * np.stack(waves, axis=1)[:, None]).reshape(-1, len(joints))
         y = residual.reshape(-1)
         remaining = (y - x @ np.linalg.lstsq(x, y, rcond=None)[0]).reshape(residual.shape)
-    return found
+    return lines
 
 
 def _gains(angle: Floats, moved: Floats, residual: Floats, orders: Ints) -> Floats:

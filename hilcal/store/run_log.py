@@ -249,8 +249,8 @@ class RunLog:
         with self._campaign.transaction() as connection:
             if self._last is not None:
                 number, crc = self._last
-                found = connection.execute("SELECT crc FROM details WHERE id = ?", (number,))
-                if found.fetchone() != (crc,):
+                row = connection.execute("SELECT crc FROM details WHERE id = ?", (number,))
+                if row.fetchone() != (crc,):
                     raise InputError(
                         f"{self._campaign.path}: reading {number} is gone: another program has "
                         "written another file over the campaign. End it, put back the newest copy "
@@ -267,8 +267,8 @@ class RunLog:
     def serial_number(self) -> str:
         """Return the serial number of the campaign's arm; empty where it is not known."""
         stated = self._campaign.about(SERIAL_NUMBER)
-        told = (_serial_number(e["answers"]) for e in self.events() if e["kind"] == "devices")
-        return stated or next(filter(None, told), "")
+        numbers = (_serial_number(e["answers"]) for e in self.events() if e["kind"] == "devices")
+        return stated or next(filter(None, numbers), "")
 
     def continues(self) -> bool:
         """Whether the campaign has had a session, or tests a model of another campaign."""

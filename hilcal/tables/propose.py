@@ -290,11 +290,11 @@ def _polar(g: words.Guesser) -> None:
         return
     free = [c for c in g.free.values() if g.number(c.name) and not c.axis and not c.has(words.STD)]
     terms = (words.AZIMUTH, words.ELEVATION, words.DISTANCE | {"d", "r", "s"})
-    found = [next((c.name for c in free if c.has(t)), "") for t in terms]
-    if all(found) and len(set(found)) == 3:
-        for name in found:
+    columns = [next((c.name for c in free if c.has(t)), "") for t in terms]
+    if all(columns) and len(set(columns)) == 3:
+        for name in columns:
             g.ignore(name, "a spherical coordinate")
-        a, z, d = found
+        a, z, d = columns
         g.proposal.missing.append(
             f"'{a}', '{z}', '{d}' are spherical coordinates: write x = d sin z cos a, "
             "y = d sin z sin a, z = d cos z in columns of their own (z from the zenith; of an "

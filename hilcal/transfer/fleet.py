@@ -243,9 +243,9 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
 
 def without_own_precision(p: Posterior, columns: Ints) -> Posterior:
     """Return a posterior without what effects' own priors state of the parameters `columns`."""
-    own = np.zeros(len(p.names))
-    own[columns] = p.own_precision[columns]
-    return replace(p, information=p.information - np.diag(own))
+    precision = np.zeros(len(p.names))
+    precision[columns] = p.own_precision[columns]
+    return replace(p, information=p.information - np.diag(precision))
 
 
 def _estimates(
@@ -269,9 +269,9 @@ def _estimates(
             inner = scaled[np.ix_(others, others)] + np.eye(int(others.sum())) / FARTHEST**2
             absorbed = positive_solve(inner, right[others])
             right[columns] -= scaled[np.ix_(columns, others)] @ absorbed
-        found = determined(information_on(scaled, columns))
-        information[c][np.ix_(indices, indices)] = found
-        free = np.linalg.pinv(found, rcond=LEAST, hermitian=True) @ right[columns]
+        marginal = determined(information_on(scaled, columns))
+        information[c][np.ix_(indices, indices)] = marginal
+        free = np.linalg.pinv(marginal, rcond=LEAST, hermitian=True) @ right[columns]
         mean[c, indices] = free * p.scale[columns] / scale[indices]
     seconds = np.array([seconds_of(m.date) for m in members])
     arm = np.array([arms.index(m.arm) for m in members])

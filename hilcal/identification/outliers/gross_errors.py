@@ -57,7 +57,7 @@ def find_gross_errors(mixed: MixedFit, mode: Mode) -> Bools:
     without, families = log_posterior(estimate.equations), len(problem.families.random)
     log_std = estimate.log_std
     shifted: list[int] = []
-    best, found = 0.0, 0
+    best, number = 0.0, 0
     while len(shifted) < int(MOST_WRONG * count):
         inner, score = estimate.equations.score(shifts.reshape(len(problem.y), count * m))
         p = _p_values(inner, score, m)
@@ -72,9 +72,9 @@ def find_gross_errors(mixed: MixedFit, mode: Mode) -> Bools:
         log_std = np.delete(estimate.log_std, families + np.arange(len(shifted)))
         odds = log_posterior(estimate.equations) - without - _price(len(shifted), count)
         if odds > best:
-            best, found = odds, len(shifted)
+            best, number = odds, len(shifted)
     out = np.zeros(count, dtype=np.bool_)
-    out[shifted[:found]] = True
+    out[shifted[:number]] = True
     return _with_deflections(out, readings, mode)
 
 

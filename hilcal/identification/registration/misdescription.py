@@ -384,8 +384,8 @@ class _DescriptionSearch:
         def white(zeros: Floats) -> Floats:
             return self._best(*self._problem(zeroed(zeros), self._rows)).white.ravel()
 
-        found = scipy.optimize.least_squares(white, np.zeros(len(turning)), diff_step=[1e-5])
-        combination = zeroed(found.x, LEAST_ZERO_DEG)
+        solution = scipy.optimize.least_squares(white, np.zeros(len(turning)), diff_step=[1e-5])
+        combination = zeroed(solution.x, LEAST_ZERO_DEG)
         return {combination: self.score(combination)}
 
     def shifted(self) -> tuple[Explanation, ...]:

@@ -142,9 +142,9 @@ def register(cell: Cell, readings: Readings) -> Registration:
         placement, null = fitted_placement(data[~far], frames, free)
         if cell.observers:
             far = _far_by_median(data.misfit(placement.frames))
-    off, found = data.misfit(placement.frames), placement.frames
+    off, placed = data.misfit(placement.frames), placement.frames
     if estimated:
-        x = data.points(found)
+        x = data.points(placed)
         spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
         in_space = m == 6 or cell.registration_known or bool(cell.observers)
         if not in_space and spread < COLLINEAR_M * np.sqrt(len(x)):
@@ -152,8 +152,8 @@ def register(cell: Cell, readings: Readings) -> Registration:
                 "registration: all positions lie in one point or on one line; measure poses "
                 "spread in space"
             )
-        cell = replace(cell.with_targets(found.targets), observers=found.observers)
-        cell = replace(cell, registration=found.base)
+        cell = replace(cell.with_targets(placed.targets), observers=placed.observers)
+        cell = replace(cell, registration=placed.base)
     rms, turn_rms = (
         float(np.sqrt(np.mean(np.sum(off[~far, part] ** 2, axis=1))))
         for part in (slice(0, 3), slice(3, 6))
@@ -164,7 +164,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
         rms=rms,
         turn_rms=turn_rms if m == 6 else None,
         far=far & (far.mean() <= MOST_WRONG),
-        undetermined=_undetermined(null, found),
+        undetermined=_undetermined(null, placed),
         never_turned=np.ptp(angles(readings), axis=0) < LEAST_TURN,
         estimated=estimated,
     )
