@@ -129,7 +129,7 @@ class Calibration(Brief):
         covariance_source = None
         if model.prior is None:  # else the covariance does not follow from these readings alone
             stated = p.excess.of_readings(used, fit.mode)
-            covariance_source = CovarianceSource(stated, p.prior, p.noise, kappa)
+            covariance_source = CovarianceSource(stated, p.prior, p.noise, kappa, p.by_variances)
         bare = cls(
             model=replace(model, readings=None, prior=None),
             theta=fit.theta,

@@ -3,11 +3,12 @@
 A transmission error has over a thousand parameters, most of which the readings do not determine.
 Their covariance has a million numbers of very different sizes, but follows from few:
 
-    κ C = κ σ² S V (E + σ²)⁻¹ Vᵀ S,      S AᵀA S = V E Vᵀ
+    κ C = κ σ² S V (E + σ²)⁻¹ Vᵀ S + κ B Bᵀ,      S AᵀA S = V E Vᵀ
 
 A (R, P) is the whitened Jacobian of the fitted states, S the prior standard deviations, σ² the
-noise factor, κ as in `calibration`. States, their noise and S take some hundred kilobytes. A and
-its eigenvectors take seconds to compute, once, when an uncertainty is first needed.
+noise factor, κ as in `calibration`, B the root of the part by the uncertainty of variances. States,
+their noise, S and B take some hundred kilobytes. A and its eigenvectors take seconds to compute,
+once, when an uncertainty is first needed.
 """
 
 import base64
@@ -36,16 +37,18 @@ class CovarianceSource:
     prior: Floats  # (P,) S
     noise: float  # σ²
     factor: float  # κ
+    by_variances: Floats  # (P, K) B
 
     def root(self, model: Model, theta: Floats, mode: Mode) -> Floats:
-        """Return R (P, P) with κ C = R Rᵀ; `theta` (P,) are the model's parameters."""
+        """Return R (P, P + K) with κ C = R Rᵀ; `theta` (P,) are the model's parameters."""
         w = whitening(self.readings, mode, "gc")
         prediction = model.predict(self.readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
         a *= self.prior
         values, vectors = np.linalg.eigh(a.T @ a)
         spread = self.factor * self.noise / (np.maximum(values, 0.0) + self.noise)
-        return np.asarray(self.prior[:, None] * vectors * np.sqrt(spread))
+        root = self.prior[:, None] * vectors * np.sqrt(spread)
+        return np.hstack([root, np.sqrt(self.factor) * self.by_variances])
 
     def check(self, model: Model) -> None:
         """Refuse quantities whose shapes do not fit a model."""
@@ -53,6 +56,7 @@ class CovarianceSource:
         count = len(r.states)
         limits.check_numbers("the source of its covariance", count * r.m * max(model.size, 1))
         numbers("prior", self.prior, (model.size,), minimum=0.0)
+        numbers("by_variances", self.by_variances, (model.size, self.by_variances.shape[1]))
         numbers("noise", self.noise, minimum=float(np.finfo(float).tiny))
         numbers("factor", self.factor, minimum=0.0)
         widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
@@ -96,6 +100,7 @@ class CovarianceSource:
             "prior": self.prior.tolist(),
             "noise": self.noise,
             "factor": self.factor,
+            "by_variances": _packed(self.by_variances),
         }
 
     @classmethod
@@ -133,7 +138,14 @@ class CovarianceSource:
             along=optional("along", _unpacked),
         )
         prior = np.array(content["prior"], dtype=float)
-        return cls(readings, prior, float(content["noise"]), float(content["factor"]))
+        by_variances = optional("by_variances", _unpacked)  # older programs had none
+        return cls(
+            readings,
+            prior,
+            noise=float(content["noise"]),
+            factor=float(content["factor"]),
+            by_variances=np.zeros((len(prior), 0)) if by_variances is None else by_variances,
+        )
 
 
 def _packed(a: np.ndarray) -> dict[str, object]:

@@ -76,6 +76,8 @@ DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.
 LARGEST_LOG_WEIGHT = 2.0
 EXCESS_LEVEL = 0.0005
 """P-value of χ² below which there is an excess: that of `diagnosis.noise.MISFIT_ALARM`."""
+NEGLIGIBLE_MOTION = 1e-3
+"""Share of the largest motion of the parameters by the variances that is negligible; a choice."""
 LEVERAGE_SAMPLE = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
 NEGLIGIBLE_CHANGE = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
@@ -180,6 +182,7 @@ class Predictive:
     model: Model
     theta: Floats  # (P,) its parameters
     covariance: Floats  # (P, P) C
+    by_variances: Floats  # (P, K) root of the part of C by the uncertainty of the variances
     prior: Floats  # (P,) prior standard deviations, Λ = diag(prior)⁻²
     excess: Excess  # of W over V
     noise: float  # σ², noise factor of the fitted readings in units of W
@@ -239,11 +242,11 @@ def predictive(
     raw = residual(fitted, prediction, stated)
     pose = distinct_poses(fitted)[stated.reading]
     fold = random_folds(pose)
-    noise_factor, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
+    noise_factor, least, by_variances = None, 1.0, np.zeros((model.size, 0))
     variances = _variances_of_random(model, fitted, mode, theta)
     if variances is not None:
         least = variance_spread(variances, stated.rows_of(fold))
-        from_variances = _by_variances(variances, model.size)
+        by_variances = _by_variances(variances, scales_of(model))
     if model.background and variances is not None:
         arm = fitted.arm_scatter  # the standard deviations are in units of its factor
         noise_factor = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
@@ -309,9 +312,9 @@ def predictive(
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
-        model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), extra, noise,
-        factor, least,
-        by_pose, scatter, left_out, scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
+        model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
+        open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
+        scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
     )  # fmt: skip
 
 
@@ -389,11 +392,16 @@ def _variances_of_random(
     return mixed_fit_at(model, replace(fitted, scatter_stated=True), mode, theta, families)
 
 
-def _by_variances(variances: Variances, size: int) -> Floats:
-    """Covariance (P, P) of the parameters by the uncertainty of the variances."""
-    e = variances.equations
-    motion = e.problem.parameters(e.sensitivity, size)
-    return np.asarray(motion @ variances.covariance @ motion.T)
+def _by_variances(variances: Variances, scale: Floats) -> Floats:
+    """Root (P, K) of the parameters' covariance by the uncertainty of the variances.
+
+    `scale` (P,) are their ordinary magnitudes, in which negligible directions are left out.
+    """
+    e, root = variances.equations, np.linalg.cholesky(variances.covariance)
+    motion = e.problem.parameters(e.sensitivity, len(scale)) @ root / scale[:, None]
+    u, s, _ = np.linalg.svd(motion, full_matrices=False)
+    kept = s > NEGLIGIBLE_MOTION * max(s.max(initial=0.0), 1e-300)
+    return np.asarray(scale[:, None] * u[:, kept] * s[kept])
 
 
 def position_factor(p: Predictive, left_out_m: float) -> float:

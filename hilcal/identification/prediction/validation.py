@@ -101,6 +101,7 @@ def with_tool(p: Predictive, cell: Cell, fitted: Readings) -> Predictive:
         model=replace(p.model, cell=tool, effects=made),
         theta=p.theta[indices],
         covariance=p.covariance[np.ix_(indices, indices)],
+        by_variances=p.by_variances[indices],
         prior=p.prior[indices],
     )
 
@@ -177,6 +178,7 @@ def set_up_anew(p: Predictive, fitted: Readings, other: Readings, mode: Mode) ->
         model=moved,
         theta=values,
         covariance=lift @ p.covariance[np.ix_(indices, indices)] @ lift.T,
+        by_variances=lift @ p.by_variances[indices],
         prior=np.concatenate([p.prior[indices], np.full(6, np.inf)]),
     )
 
