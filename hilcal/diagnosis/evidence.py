@@ -31,7 +31,6 @@ repeats or a generic regression show that it is not noise.
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import takewhile
 
 import numpy as np
 import scipy
@@ -247,10 +246,17 @@ def catalogue_families(
 
 
 def significant(families: CandidateFamilies) -> list[Addition]:
-    """Return the additions that are significant, each beside the previous ones."""
+    """Return the additions that are significant, each beside the previous ones.
+
+    A family of as many columns as there are degrees of freedom may have the most evidence and fail
+    the F-test: the others are then added without it.
+    """
     level = FALSE_ALARM / max(len(families.columns), 1)
-    steps = forward_selection(families, MOST_BY_ALGEBRA)
-    return list(takewhile(lambda s: s.score.log_evidence > 0 and s.score.p_value < level, steps))
+
+    def passes(score: FamilyScore) -> bool:
+        return score.log_evidence > 0 and score.p_value < level
+
+    return list(forward_selection(families, MOST_BY_ALGEBRA, passes))
 
 
 class Evidence:

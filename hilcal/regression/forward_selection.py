@@ -17,7 +17,7 @@ without a prior. All products are sums over rows: they are formed once for each 
 without a fold are the sums over the other folds.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import Any
@@ -80,7 +80,7 @@ def families_beside(
 class Addition:
     """A proposed step of forward selection."""
 
-    name: str  # the family with most evidence
+    name: str  # the family with most evidence, of those that pass
     score: FamilyScore
     scores: Mapping[str, FamilyScore]  # of all candidate families
     before: CandidateFamilies  # without the proposed family in the model
@@ -91,17 +91,22 @@ class Addition:
         return self.before.with_family(self.name, self.score)
 
 
-def forward_selection(families: CandidateFamilies, most: int) -> Iterator[Addition]:
+def forward_selection(
+    families: CandidateFamilies,
+    most: int,
+    passes: Callable[[FamilyScore], bool] = lambda score: True,
+) -> Iterator[Addition]:
     """Yield up to `most` additions, each with the previous ones in the model.
 
-    An addition is carried out when the next one is requested, so that the caller decides when to
-    stop.
+    Each is the family with most evidence of those that pass. An addition is carried out when the
+    next one is requested, so that the caller decides when to stop.
     """
     for _ in range(most):
-        if not families.columns:
-            return
         scores = families.scores()
-        best = max(scores, key=lambda n: scores[n].log_evidence)
+        passing = [n for n, score in scores.items() if passes(score)]
+        if not passing:
+            return
+        best = max(passing, key=lambda n: scores[n].log_evidence)
         step = Addition(best, scores[best], scores, families)
         yield step
         families = step.after

@@ -9,7 +9,12 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hilcal.diagnosis.effect_ranking import candidates
-from hilcal.diagnosis.evidence import REDUNDANCY_LEVEL, backward_elimination, model_columns
+from hilcal.diagnosis.evidence import (
+    REDUNDANCY_LEVEL,
+    backward_elimination,
+    model_columns,
+    significant,
+)
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.diagnosis.verdict import IMITATION, diagnose
 from hilcal.drivers.simulated.injected_effects import hide_effect
@@ -24,6 +29,8 @@ from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.linearisation import columns_of_each, eliminate_effect
 from hilcal.present.verdict import message
 from hilcal.refinement import Path, refine
+from hilcal.regression.evidence import NO_EVIDENCE
+from hilcal.regression.forward_selection import CandidateFamilies
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import NO_EFFECT, campaign, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline, studied
@@ -297,3 +304,16 @@ def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
         refusal("hysteresis is not in the model", changed)
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
         exchange(found, "backlash", "joint_compliance")
+
+
+def test_a_family_that_fails_its_test_hides_no_other(monkeypatch):
+    """A large one may have the most evidence, and a p-value that is not significant."""
+    tests = {"large": (26.5, 0.0026), "small": (13.5, 1e-6), "none": (-1.0, 0.5)}
+    score = {
+        name: replace(NO_EVIDENCE, log_evidence=evidence, p_value=p, ridge=1.0)
+        for name, (evidence, p) in tests.items()
+    }
+    monkeypatch.setattr(CandidateFamilies, "scores", lambda f: {n: score[n] for n in f.columns})
+    columns = {name: slice(k, k + 1) for k, name in enumerate(tests)}
+    families = CandidateFamilies(np.eye(3), np.ones(3), 100.0, 50.0, columns)
+    assert [step.name for step in significant(families)] == ["small"]
