@@ -56,12 +56,11 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.regression.leave_out import improves
 from hilcal.shown import Brief, Shown
-from hilcal.store.revision import change
+from hilcal.store.revision import BACKGROUND, change
 
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
-BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
 PRIOR = "prior"  # `RefinementStep.removed` of a step that leaves the carried prior out
 UNEXPLAINED_VERDICTS = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove

@@ -187,10 +187,10 @@ def retry_after_failures(
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
-    with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
+    with counting(t.progress, "measuring readings", len(readings)) as advance:
         for begin, end in pairwise(starts):
             campaign.append_readings(readings[slice(begin, end)])
-            advance(1)
+            advance(end - begin)
 
 
 NEXT_SEED = 1000  # Between the seeds of two starts: devices use the seed and the next few numbers

@@ -320,7 +320,7 @@ def _revisions_tables(o: Overview) -> Iterator[Block]:
 def model_words(r: RevisionRecord) -> str:
     """Return the changes of a revision, or its whole model if it is the first; and its cell."""
     scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
-    model = change(r.added, r.removed, scatter) or model_name(r.effects)
+    model = change(r.added, r.removed, scatter, r.effects) or model_name(r.effects)
     return f"{model}; {cell_words(r.cell)}" if r.cell else model
 
 

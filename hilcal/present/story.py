@@ -230,7 +230,8 @@ class Chapter:
     @property
     def change(self) -> str:
         """The change of the model, e.g. "+ hysteresis"; empty for a first model."""
-        return change(self.added, self.removed, self.fit.readings.arm_scatter is not None)
+        scatter, named = self.fit.readings.arm_scatter is not None, self.fit.model.named
+        return change(self.added, self.removed, scatter, named)
 
     @property
     def cells(self) -> tuple[str, ...]:

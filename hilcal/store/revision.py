@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -94,8 +94,19 @@ class RevisionRecord(Brief):
         return scatter and self.added is self.removed is None
 
 
-def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
-    """Return the change of a revision as "+ a", "− b" or "+ a − b"; empty for a first model."""
+BACKGROUND = "background"  # `added` of a revision whose other effects are a background
+
+
+def change(
+    added: str | None, removed: str | None, scatter: bool = False, named: Sequence[str] = ()
+) -> str:
+    """Return the change of a revision as "+ a", "− b" or "+ a − b"; empty for a first model.
+
+    A background takes up added effects that the readings do not prove: with it, all that are
+    `named` are listed.
+    """
+    if added == BACKGROUND and named:
+        return " + ".join([*named, BACKGROUND])
     if scatter and added is None and removed is None:
         return "arm's scatter"
     return " ".join(f"{sign} {effect}" for sign, effect in (("+", added), ("−", removed)) if effect)

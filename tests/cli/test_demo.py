@@ -1,5 +1,7 @@
 """The demo, what `run` asks without a plan, and going on after a failure."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -57,9 +59,10 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("hilcal.cli.simulating.first_plan", plan)
     path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
     arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "--poses", "8", "-o", path)
-    words = ok(capsys, *arguments, "--record", recording).out
+    printed = ok(capsys, *arguments, "--record", recording)
+    words, (count,) = printed.out, re.findall(r"measuring readings: (\d+)", printed.err)
     for part in (
-        " readings.",
+        f": {count} readings.",
         "The misfit follows joint",
         "hysteresis is missing",
         "noise alone",

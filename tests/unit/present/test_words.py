@@ -369,6 +369,9 @@ def test_naming_an_effect_of_the_background_is_no_denial_of_it():
     c = campaign(mode="deflection", seed=1)
     f = fitted_model(c.cell, c.readings, "deflection")
     before = with_background(f, f.model.names)
+    # what was added before it and is not proved is in it: the model is listed, not "+ background"
+    named = " + ".join(before.model.named)
+    assert Chapter(3, "background", before, None).change == f"{named} + background"
     effect = sorted(before.model.background)[0]
     said = change_sentence(before, add(before, effect), effect, added=True)
     assert said.startswith(f"{effect} is named now; predictions included it already")
