@@ -18,7 +18,7 @@ from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NO_HISTORY
 from hilcal.diagnosis.verdict import diagnose as judge
-from hilcal.discovery.discovery import LawSearch, discovery_json, laws_json, rival_sources
+from hilcal.discovery.discovery import LawSearch, laws_json, rival_sources
 from hilcal.discovery.discovery import discover as search
 from hilcal.discovery.law import PROPOSED
 from hilcal.effects.catalogue import Catalogue
@@ -106,11 +106,15 @@ def _show_next_command(
     else:
         return
     line += [] if revision is None else ["--revision", str(revision)]
-    files = (catalogue.file_of(name) for name in (*d.fit.model.names, *doubt))
-    for path in dict.fromkeys(f.path for f in files if f is not None):
-        line += ["--effects-from", quoted(path)]
     t.show(what)
-    t.command(" ".join(line))
+    t.command(" ".join([*line, *_effect_files(catalogue, (*d.fit.model.names, *doubt))]))
+
+
+def _effect_files(catalogue: Catalogue, names: Iterable[str]) -> list[str]:
+    """Return the options that give a command the files of effects."""
+    files = (catalogue.file_of(name) for name in names)
+    paths = dict.fromkeys(f.path for f in files if f is not None)
+    return [word for path in paths for word in ("--effects-from", quoted(path))]
 
 
 @command("""
@@ -350,7 +354,7 @@ def discover(
             say(f"fitting {model_name(model.named)}")
             fitted = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(fitted, say, name)
-    document = {"revision": number, **discovery_json(d), "written": None}
+    document = {"revision": number, **d.to_dict(), "written": None}
     t.show(words.discovery_report(d))
     if not d.laws:
         t.document(document, CannotAnswerError(words.no_law_sentence(d)))
@@ -364,14 +368,18 @@ def discover(
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )
-    t.command(f"hilcal add {quoted(run)} {name} --effects-from {quoted(output)}")
-    t.command(f"hilcal diagnose {quoted(run)} --effects-from {quoted(output)}")
+    known = " ".join(["", *_effect_files(catalogue, fitted.model.names)])
+    base = "" if revision is None else f" --revision {revision}"
+    law = f"{known} --effects-from {quoted(output)}"
+    t.command(f"hilcal add {quoted(run)} {name}{base}{law}")
+    t.command(f"hilcal diagnose {quoted(run)}{law}")
     if alternatives and not rivals:
         t.show("No other law explains these readings as well.")
     if rivals:
         t.show("Plan the measurements that separate it from what explains these readings as well:")
-        files = " ".join(f"--effects-from {quoted(places[effect])}" for effect in written)
-        t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {','.join(written)} {files}")
+        files = "".join(f" --effects-from {quoted(places[effect])}" for effect in rivals)
+        suspects = f"{','.join(written)}{base}{law}{files}"
+        t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {suspects}")
     rival_files = [{"name": effect, "written": str(places[effect])} for effect in rivals]
     t.document({**document, "written": str(output), "alternatives": rival_files})
 

@@ -107,9 +107,41 @@ class Discovery(Shown):
     structures: tuple[Structure, ...] = ()  # likely laws, and the best of each complexity
 
     def __repr__(self) -> str:
-        """Return the reason, and the formulas with their probabilities."""
+        """Return the reason, the effects that explain it, and formulas with their probabilities."""
         rows = [f"\n  {x.probability:.3f}  {x.form.text()}" for x in self.structures]
-        return f"Discovery({self.reason!r}{''.join(rows)})"
+        return f"Discovery({', '.join(map(repr, (self.reason, *self.catalogue)))}{''.join(rows)})"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the result as JSON, as `hilcal discover --json` prints it."""
+        return {
+            "model": list(self.fit.model.named),
+            "reason": self.reason,
+            "attainable_share": self.attainable,
+            "searched_share": self.searched_share,
+            "candidates": self.candidates,
+            "catalogue": list(self.catalogue),
+            "carried_by": [
+                {"variable": c.variable, "share": c.share, "moves": c.moves} for c in self.carried
+            ],
+            "laws": [law_json(law, self) for law in self.laws],
+            "structures": [
+                {
+                    "formula": x.form.text(),
+                    "probability": x.probability,
+                    "complexity": x.form.complexity,
+                    "holdout_share": x.holdout_share,
+                    "pareto": x in pareto(self.structures),
+                    "law": x.law or None,
+                }
+                for x in self.structures
+            ],
+            "refused": [{"formula": formula, "why": why} for formula, why in self.refused],
+            "unfitted": [{"effect": effect, "why": why} for effect, why in self.unfitted],
+            "average": dict(zip(("rms_m", "std_m"), self.average_m(), strict=True))
+            if self.laws
+            else None,
+            "curves": [curve_json(c) for c in self.curves],
+        }
 
     def average(self, readings: Readings) -> tuple[Floats, Floats]:
         """Return the model average of the likely laws' motion of readings, and its std."""
@@ -377,37 +409,6 @@ def agreement(before: Fit, after: Fit, moved: Floats) -> float:
     return float(truth @ added) / max(size, 1e-300)
 
 
-def discovery_json(d: Discovery) -> dict[str, object]:
-    """Return the document of `discover`."""
-    return {
-        "model": list(d.fit.model.named),
-        "reason": d.reason,
-        "attainable_share": d.attainable,
-        "searched_share": d.searched_share,
-        "candidates": d.candidates,
-        "catalogue": list(d.catalogue),
-        "carried_by": [
-            {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
-        ],
-        "laws": [law_json(law, d) for law in d.laws],
-        "structures": [
-            {
-                "formula": x.form.text(),
-                "probability": x.probability,
-                "complexity": x.form.complexity,
-                "holdout_share": x.holdout_share,
-                "pareto": x in pareto(d.structures),
-                "law": x.law or None,
-            }
-            for x in d.structures
-        ],
-        "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
-        "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
-        "average": dict(zip(("rms_m", "std_m"), d.average_m(), strict=True)) if d.laws else None,
-        "curves": [curve_json(c) for c in d.curves],
-    }
-
-
 def law_json(law: Law, d: Discovery) -> dict[str, object]:
     """Return a law as JSON."""
     return {
@@ -521,7 +522,7 @@ def laws_json(s: LawSearch) -> dict[str, object]:
     written = [s.files.get(d.laws[0].name) if d.laws else None for d in s.discoveries]
     return {
         "discover": [
-            {**discovery_json(d), "written": file and str(file)}
+            {**d.to_dict(), "written": file and str(file)}
             for d, file in zip(s.discoveries, written, strict=True)
         ]
     }

@@ -108,7 +108,14 @@ def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monk
     assert found.document["written"] == str(out)
     assert found.document["laws"][0]["formula"] == "dq_2 = a"
     assert [kind.name for kind in read_effects(out).effects] == ["bent"]
-    assert "--effects-from" in found.err
+    # the commands that are told work in the searched revision, and know its own effects
+    mine = tmp_path / "mine.py"
+    mine.write_text(source_of_form(hardly, "mine", law.parameters), encoding="utf-8")
+    known = ("--effects-from", mine)
+    ok(capsys, "identify", creeping, "--effects", "joint_compliance, mine", *known)
+    found = ok(capsys, "discover", creeping, "-o", out, "--revision", "2", *known, "--json")
+    told = f"hilcal add {creeping} bent --revision 2 --effects-from {mine} --effects-from {out}"
+    assert told in " ".join(found.err.split())
 
 
 def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path, capsys):

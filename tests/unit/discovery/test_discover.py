@@ -10,7 +10,7 @@ import pytest
 import hilcal as hc
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
-from hilcal.discovery.discovery import Discovery, LawSearch, discover, discovery_json, laws_json
+from hilcal.discovery.discovery import Discovery, LawSearch, discover, laws_json
 from hilcal.discovery.known_effects import (
     Replacement,
     effects_replacing_law,
@@ -168,7 +168,7 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
     assert "add their times" in no_law_sentence(d)
     assert "row order explains" in "".join(map(str, discovery_report(d)))
-    assert discovery_json(d)["carried_by"][0]["variable"] == "row order"
+    assert d.to_dict()["carried_by"][0]["variable"] == "row order"
 
 
 @cache
@@ -223,7 +223,7 @@ def test_the_curve_of_a_law_lies_where_the_readings_are():
         assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
     told = "".join(str(part) for part in discovery_report(found()))
     assert "valid for" in told
-    drawn = discovery_json(found())["curves"][0]
+    drawn = found().to_dict()["curves"][0]
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 
 
@@ -334,9 +334,10 @@ def test_no_refit_fails_in_silence(monkeypatch):
     assert "load_point could not be tried in the exact model (it finds no eq" in no_law_sentence(
         answer
     )
-    assert discovery_json(answer)["unfitted"] == [
-        {"effect": "load_point", "why": found.unfitted[0][1]}
-    ]
+    assert repr(replace(answer, reason="catalogue", catalogue=("creep",))) == (
+        "Discovery('catalogue', 'creep')"
+    )
+    assert answer.to_dict()["unfitted"] == [{"effect": "load_point", "why": found.unfitted[0][1]}]
 
 
 def _with_load_off(shift):
