@@ -33,6 +33,7 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identification.noise.full_covariance import full_readings
 from hilcal.measuring.route import dry_run
+from hilcal.measuring.run import HOW_ON
 from hilcal.present.diagnosis import RUN_EXPLANATION
 from hilcal.present.progress import Say, counting, working
 from hilcal.procedure.procedure import Measure, Procedure
@@ -181,7 +182,7 @@ def retry_after_failures(
             tries, stored = (TRIES if current > stored else tries) - 1, current
             if tries <= 0:
                 raise
-            t.notice(f"note: {error}")
+            t.notice(f"note: {str(error).removesuffix(HOW_ON).rstrip()}")
             t.notice("continuing with the missing readings")
 
 

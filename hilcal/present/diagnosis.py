@@ -53,6 +53,9 @@ def verdict_line(d: Diagnosis) -> Words:
     return Words(f"Verdict: {headline(d)}.\n{message(d)}", tone, headline(d))
 
 
+ORDER = "Effects that pass every test come first, then by evidence, which charges for parameters."
+
+
 def suspects_table(d: Diagnosis, most: int = MOST_SUSPECTS) -> Table:
     """Return the table of the most significant suspects."""
     heads = ("missing effect?", "explains", "on poses left out", "p-value", "inseparable from")
@@ -78,8 +81,8 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     if d.significant or d.reason == "unconfirmed_suspect":
         yield suspects_table(d)
         yield note(
-            "explains: share of the misfit, the error beyond noise, that adding the effect would "
-            "remove; p-value: chance of that share without the effect. "
+            f"{ORDER} explains: share of the misfit, the error beyond noise, that adding the "
+            "effect would remove; p-value: chance of that share without the effect. "
             f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n"
         )
     if d.verdict != "adequate":

@@ -133,6 +133,8 @@ def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
     try:
         missing = f"no such file; expected a {name}"
         content = parse_json(limits.read_text(path, limits.DOCUMENT, missing))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: no {name}: it is no JSON from line {error.lineno} on") from None
     except ValueError as error:
         raise InputError(f"{path}: no {name}: {error}") from None
     try:

@@ -18,7 +18,7 @@ from hilcal.diagnosis.recorded import Difference
 from hilcal.names import escaped
 from hilcal.present import charts
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
-from hilcal.present.diagnosis import shown_suspects, suspects_table
+from hilcal.present.diagnosis import ORDER, shown_suspects, suspects_table
 from hilcal.present.document import Table, description_of, load_name
 from hilcal.present.document import table as block
 from hilcal.present.fit import dependence_sentence, holdout_sentence, model_name
@@ -162,8 +162,8 @@ def _suspects(view: View, d: Snapshot) -> None:
                     f"These readings do not separate {rows[0].effect} from {numbers.few(same)}."
                 )
             small_print(
-                "explains: share of the misfit that adding it would remove; p-value: chance of "
-                "that much if it were not there."
+                f"{ORDER} explains: share of the misfit that adding it would remove; p-value: "
+                "chance of that much if it were not there."
             )
         else:
             small_print("No effect passes the tests by itself: see the verdict.")

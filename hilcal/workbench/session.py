@@ -259,6 +259,8 @@ class WorkbenchSession:
         `poses` None is the number that the doubt needs; `quick` omits the comparison of criteria
         and numbers of poses. Raises InputError if the file exists, and as `next_plan`.
         """
+        if output.is_dir():
+            raise InputError('the plan file has no name; valid: a name, e.g. "next.json"')
         if output.exists():
             raise InputError(f"{output}: the file exists; choose another name")
         self._require(snapshot)

@@ -9,6 +9,7 @@ from hilcal.cli.simulating import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.run import HOW_ON
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import purpose_of
@@ -177,7 +178,7 @@ def work(failures):
     def once():
         calls.append(1)
         if len(calls) <= failures:
-            raise DeviceError("force sensor: nothing came for 0.2 s")
+            raise DeviceError(f"force sensor: nothing came for 0.2 s. {HOW_ON}")
 
     return once, calls
 
@@ -189,6 +190,7 @@ def test_what_is_missing_is_measured_after_a_failure(failures, comes, capsys):
     retry_after_failures(terminal(False), once, lambda: len(calls) // 2 if comes else 7)
     said = capsys.readouterr()
     assert (said.out + said.err).count("nothing came for 0.2 s") == failures == len(calls) - 1
+    assert "run again" not in said.out + said.err  # it goes on by itself
 
 
 def test_a_device_that_always_fails_ends_it():

@@ -177,6 +177,7 @@ def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
     path = tmp_path / "c.json"
     for content, words in [
         ("{", "no calibration"),
+        ('[robot]\nmodel = "ur5"', "no calibration: it is no JSON from line 1 on"),
         ("[]", '"format": "hilcal-calibration"'),
         (json.dumps({**good, "version": 3}), "reads versions 1 and 2"),
         (json.dumps({**good, "theta": [1.0]}), "damaged"),

@@ -179,6 +179,7 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run, session, snaps
     exists = run.with_name("there.json")
     exists.touch()
     refusal("the file exists; choose another name", session.plan, snapshot, None, exists)
+    refusal("the plan file has no name", session.plan, snapshot, None, exists.parent)
     kept = session.remove(snapshot, "joint_compliance")
     assert kept.diagnosis.verdict != "ambiguous"
     with pytest.raises(CannotAnswerError, match="no suspects to separate"):
