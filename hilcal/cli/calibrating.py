@@ -46,6 +46,13 @@ from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
 FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
+TOO_LATE = (
+    ("--poses", "poses"),
+    ("--goal", "goal_m"),
+    ("--max-time", "max_time_s"),
+    ("--validation", "validation"),
+)
+"""Options that decide nothing any more: the first once a campaign exists, all once it is tested."""
 DEFAULT_MAX_TIME = "2 h"  # Longest time for measuring; a choice
 
 
@@ -221,6 +228,14 @@ def _procedure(
         message = f"{output}: holds a calibration already, {words.state_clause(p.next())}"
         raise InputError(f"{message}; go on with: {go_on}")
     _refuse_goal(p.settings.readings, stated, path)
+    too_late = TOO_LATE if p.files.validation.exists() else TOO_LATE[:1]
+    for option, key in too_late:
+        current = getattr(p.settings, key)
+        if stated.get(key, current) != current:
+            raise InputError(
+                f"{option} comes too late: what it decides was done before; leave it out, or "
+                "calibrate into another file"
+            )
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
