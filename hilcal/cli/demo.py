@@ -415,7 +415,8 @@ def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[b
 
 
 def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
-    added = [s.added for s in refinement.steps if s.added]
+    named = refinement.fit.model.named  # an effect may be added, and later go into a background
+    added = [s.added for s in refinement.steps if s.added in named]
     if r.hidden == NO_EFFECT:
         if not added and refinement.verdict == "adequate":
             return True, "No effect was hidden, and none was found."
