@@ -381,7 +381,8 @@ def _variances_of_random(
         return mixed_fit_at(model, fitted, mode, theta)
     lines = {e.name for e in model.effects if e.groups() is not None}
     shrunk = lines | set(model.random)
-    if not shrunk or fitted.value.size > MOST_ROWS:
+    # a carried prior states the sizes of its effects
+    if not shrunk or model.prior is not None or fitted.value.size > MOST_ROWS:
         return None
     # As `with_shrunk_effects` fits them, with the arm's scatter in the covariance. Flat effects
     # have the prior of C: where the readings leave one open, no variance moves it without limit.
