@@ -39,6 +39,7 @@ def ambiguous(tmp_path):
     return stored(tmp_path / "run.hilcal", BASE, 2)
 
 
+@pytest.mark.long
 def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     ok(capsys, "identify", ambiguous)
     plan, table = tmp_path / "next.json", tmp_path / "next.csv"

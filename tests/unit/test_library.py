@@ -97,8 +97,11 @@ def names():
     return [name for name in hc.__all__ if not name.startswith("__")]
 
 
+LONG = ("Calibration", "discover")  # the first compiles the inverse
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()]
+    "name", [pytest.param(n, marks=pytest.mark.long if n in LONG else ()) for n in names()]
 )
 def test_the_examples_of_a_docstring_run(name, site, free_port):
     thing = getattr(hc, name)

@@ -69,6 +69,7 @@ def run(tmp_path):
 
 @per_example_file
 @given(x=readings())
+@pytest.mark.long
 def test_round_trip_is_exact(tmp_path, x):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, "{}", "", "", overwrite=True) as campaign:

@@ -95,6 +95,7 @@ def test_prediction_is_what_identification_states_of_several_targets(mode):
 
 
 @pytest.mark.parametrize("mode", first(1, MODES))
+@pytest.mark.long
 def test_parameters_and_positions_scatter_as_predicted(mode):
     cell = cell_of(registration_known=True)
     config = config_of(mode, work_load="10kg")

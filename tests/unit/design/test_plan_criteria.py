@@ -254,6 +254,7 @@ def test_known_optima(criterion, degree, expected):
     known=st.booleans(),
     most=st.sampled_from([None, 1, 2]),
 )
+@pytest.mark.long
 def test_no_plan_exceeds_the_bound(name, seed, costs, known, most):
     """Random plans, and the planner's own."""
     criterion = OF_THREE[name]

@@ -178,6 +178,7 @@ def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
     ("wave", "instead"),
     [(0.0, ("air temperature",)), pytest.param(3.0, (), marks=pytest.mark.long)],
 )
+@pytest.mark.long
 def test_an_effect_in_time_may_be_one_in_an_air_temperature_that_rises_with_it(wave, instead):
     c = hidden("tracker_drift", "absolute", 0)
     t = (c.readings.states.time - c.readings.states.time.min()) / np.ptp(c.readings.states.time)

@@ -33,6 +33,7 @@ def campaign(rho, mode="absolute", seed=0, hidden="", poses=10):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("rho", first(1, [0.9, 0.7, 0.99]))
+@pytest.mark.long
 def test_the_correlation_comes_out(mode, rho):
     found = serial_noise(fitted_model(*campaign(rho, mode), mode))
     assert found.proved

@@ -282,6 +282,7 @@ def refined(tmp_path_factory):
     return path, other, last
 
 
+@pytest.mark.long
 def test_fresh_readings_scatter_as_the_fit_with_a_background_estimated():
     """Their covariance is that of the instrument: errors were 2.3 times the stated ones."""
     (cell, readings), (_, anew) = scattering(6e-5), scattering(6e-5, draw=7)

@@ -22,7 +22,7 @@ from hilcal.identification.carried.posterior import (
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
-from hilcal.identification.prediction.predictive import predictive
+from hilcal.identification.prediction.predictive import predictive, predictive_of
 from hilcal.present.fit import prior_lines
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.codec import write_document
@@ -108,6 +108,16 @@ def test_a_harmonic_that_was_dropped_is_not_known_to_be_zero():
     std = p.std[p.index("transmission_error")][dropped]
     assert len(std)
     assert ((std > 0) & np.isfinite(std)).all()
+
+
+def test_the_sizes_of_what_a_prior_knows_are_not_estimated_again():
+    """As if they were, the band of 20 poses held all other poses, not 97.6 %."""
+    c = of_links(seed=3)
+    some = c.readings[c.readings.pose < 12]
+    prior = carried_prior(Posterior.of(fitted("transmission_error")))
+    of_prior = fit(baseline(c.cell, some, "absolute", prior=prior), some, "absolute")
+    assert not predictive_of(of_prior).by_variances.size
+    assert predictive_of(fitted("transmission_error")).by_variances.size
 
 
 def test_what_is_no_posterior_is_refused():

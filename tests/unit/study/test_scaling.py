@@ -59,6 +59,7 @@ def linear_estimator(a, weight):
 
 
 @pytest.mark.parametrize("seed", first(1, [SEED, 100, 101, 102]))
+@pytest.mark.long
 def test_gc_attains_the_cramer_rao_bound_and_its_intervals_cover(study, seed):
     """Neither is luck: other seeds give other poses and other noise."""
     if seed != SEED:
