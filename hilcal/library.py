@@ -227,7 +227,7 @@ def bootstrap(
     ((20, 12), (2, 12))
 
     Args:
-        found: the fit; `ratio` of the result compares its standard uncertainties.
+        fit: whose standard uncertainties `ratio` of the result compares.
         workers: processes of this machine, which the result does not depend on; None: one per
             processor, for scripts that begin with `if __name__ == "__main__"`.
         scheduler: address of a Dask cluster to use instead.
