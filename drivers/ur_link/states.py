@@ -50,9 +50,9 @@ _SAFETY = (
 
 
 def safety_word(bits: int, mode: int = RUNNING) -> str:
-    """Return the name of the safety state; without a bit, of the mode of an arm with its brakes on.
+    """Return the name of the safety state, or of a robot mode that keeps the arm from moving.
 
-    "normal": the arm can move.
+    "normal" if it can move.
     """
     ready = NORMAL if mode == RUNNING else f"not running ({mode_word(mode)})"
     return next((word for bit, word, _ in _SAFETY if bits >> bit & 1), ready)

@@ -52,7 +52,7 @@ TOO_LATE = (
     ("--max-time", "max_time_s"),
     ("--validation", "validation"),
 )
-"""Options that decide nothing any more: the first once a campaign exists, all once it is tested."""
+"""Options without effect: the first once a campaign exists, all once its validation is planned."""
 DEFAULT_MAX_TIME = "2 h"  # Longest time for measuring; a choice
 
 
@@ -233,8 +233,8 @@ def _procedure(
         current = getattr(p.settings, key)
         if stated.get(key, current) != current:
             raise InputError(
-                f"{option} comes too late: what it decides was done before; leave it out, or "
-                "calibrate into another file"
+                f"{option} comes too late: the measurements that it decides are planned already; "
+                "leave it out, or calibrate into another file"
             )
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:

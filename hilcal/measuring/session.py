@@ -224,7 +224,7 @@ class Session:
             joint = self._cell.arm.joint_names[int(turn.argmax())]
             self._remark(
                 f"the first motion turns {joint} by {np.degrees(turn.max()):.0f}°: see that "
-                "cables and hoses bear it, or drive the joint back by hand first"
+                "cables and hoses bear it, or bring the arm nearer by hand first"
             )
         self._hook.take_all_off()
         expected, place = (sample.q, WHERE_LEFT) if last_q is None else (last_q, AT_LAST)

@@ -53,7 +53,7 @@ def verdict_line(d: Diagnosis) -> Words:
     return Words(f"Verdict: {headline(d)}.\n{message(d)}", tone, headline(d))
 
 
-ORDER = "Effects that pass every test come first, then by evidence, which charges for parameters."
+ORDER = "Effects that pass every test stand first; others by evidence, less for more parameters."
 
 
 def suspects_table(d: Diagnosis, most: int = MOST_SUSPECTS) -> Table:

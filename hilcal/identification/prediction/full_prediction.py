@@ -58,9 +58,9 @@ class FullPrediction:
 
     @property
     def noise_factor(self) -> float:
-        """Standard deviation of the noise in units of the covariance.
+        """Standard deviation of the noise in units of that of the covariance.
 
-        1, or that of the instrument's noise beside which the arm's scatter was estimated.
+        1; beside a background the estimated factor of the instrument's noise (`ArmScatter.unit`).
         """
         scatter = self.readings.arm_scatter
         return 1.0 if scatter is None else scatter.unit

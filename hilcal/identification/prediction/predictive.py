@@ -385,7 +385,7 @@ def _variances_of_random(
     if not shrunk or model.prior is not None or fitted.value.size > MOST_ROWS:
         return None
     # As `with_shrunk_effects` fits them, with the arm's scatter in the covariance. Flat effects
-    # have the prior of C: where the readings leave one open, no variance moves it without limit.
+    # have their prior in C; without it the variances would move an undetermined one at will.
     magnitude = ordinary_magnitudes(model, theta)
     parts = zip(model.effects, model.slices(), strict=True)
     known = {e.name: magnitude[rows] for e, rows in parts if e.name not in shrunk}

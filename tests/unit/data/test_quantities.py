@@ -67,24 +67,15 @@ def test_a_range_of_more_than_a_turn_has_every_angle():
     assert wide.beyond(angles).any()
 
 
-def test_a_joint_a_little_warmer_is_no_extrapolation():
-    warmth = Range("joint 1 temperature", "K", 293.0, 294.0)
-    assert warmth.beyond(np.array([291.9, 292.1, 294.9, 295.1])).tolist() == [
-        True,
-        False,
-        False,
-        True,
-    ]
-
-
-def test_the_correction_of_a_joint_that_stood_still_is_no_extrapolation():
-    still = Range("joint 4 angle", "rad", 0.3, 0.3)
-    assert still.beyond(np.array([0.289, 0.299, 0.301, 0.311])).tolist() == [
-        True,
-        False,
-        False,
-        True,
-    ]
+@pytest.mark.parametrize(
+    ("measured", "values"),
+    [
+        (Range("joint 1 temperature", "K", 293.0, 294.0), [291.9, 292.1, 294.9, 295.1]),
+        (Range("joint 4 angle", "rad", 0.3, 0.3), [0.289, 0.299, 0.301, 0.311]),
+    ],
+)
+def test_a_little_warmer_or_a_small_correction_is_no_extrapolation(measured, values):
+    assert measured.beyond(np.array(values)).tolist() == [True, False, False, True]
 
 
 NAMES = ("R1", "R2", "R3")

@@ -210,7 +210,7 @@ def test_p_values_and_how_many_were_tested_read_the_same_wherever_they_stand(
     assert tests["each"] == pytest.approx(FALSE_ALARM / tests["count"])
     report, tested = shown(*diagnosis_report(judged)), f"{tests['count']} effects were tested"
     assert f"{tested}: one counts from p < " in report
-    assert "Effects that pass every test come first, then by evidence" in report
+    assert "Effects that pass every test stand first; others by evidence" in report
     assert f"which is 0.001 / {tests['count']}" in report
     kinds = [v for v in judged.misfit_breakdown if v.group not in ("pose", "direction")]
     assert f"{len(kinds)} variables were tested" in report
