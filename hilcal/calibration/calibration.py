@@ -51,6 +51,7 @@ from hilcal.identification.gauss_newton import derivative
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
     RobotFrames,
+    drawn_flange,
     robot_frames,
     state_with_every_column,
     whole_turns,
@@ -308,7 +309,20 @@ class Calibration(Brief):
         turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
         if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
             raise InputError("tool is no (4, 4) pose on the flange: a rotation and a position")
-        return tool_of(self.model, self.theta, pose)
+        return tool_of(self.model, self.theta, self._flange @ pose)
+
+    @cached_property
+    def _flange(self) -> Floats:
+        """(4, 4) the fitted flange, turned about the target as drawn where attitudes are fitted.
+
+        They do not tell that turn (see `_turn_std`): what is fitted is the mean attitude error of
+        the nominal arm, which the target's estimated turn has.
+        """
+        if not self.turn_std:
+            return np.eye(4)
+        target = self._tracked.nominal[:3, 3]
+        turn = drawn_flange(self.frames.links, self.model.cell.arm.links)[0][:3, :3]
+        return se3.matrix(turn, target - turn @ target)
 
     def _states(
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
@@ -415,22 +429,23 @@ def _turn_std(fit: Fit) -> float:
     """Return the standard deviation, rad, of the flange's turn that attitudes do not tell.
 
     One target's turn on the flange is estimated from its attitudes by the nominal arm, and held; so
-    a turn of the last link is known by its prior alone, and has the size of it.
+    turns behind the last joint, and about its axis, are known by their priors alone. Their variance
+    is taken as the same about each axis.
     """
-    model = fit.model
+    model, n = fit.model, fit.model.cell.arm.n
     if fit.mode != "absolute" or fit.readings.m == 3 or model.cell.targets is not None:
         return 0.0
     if any(e.role == "target" for e in model.effects):  # then its turn is estimated with the others
         return 0.0
-    last, prior = f"link{model.cell.arm.n}.", fit.solution.prior
+    turning = [f"link{n}.rx", f"link{n}.ry", f"link{n}.rz", f"link{n - 1}.rz"]
+    prior = fit.solution.prior
     sizes = [
         e.magnitudes[k] if np.isinf(prior[part][k]) else prior[part][k]
         for e, part in zip(model.effects, model.slices(), strict=True)
         for k, p in enumerate(e.parameters)
-        if e.change is not None and e.change.kind == "link" and p.name.startswith(last)
-        if p.unit == "rad"
+        if e.change is not None and e.change.kind == "link" and p.name in turning
     ]
-    return float(np.sqrt(np.mean(np.square(sizes)))) if sizes else 0.0
+    return float(np.sqrt(np.sum(np.square(sizes)) / 3.0))
 
 
 def _unloaded(states: States) -> States:

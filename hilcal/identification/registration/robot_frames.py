@@ -78,10 +78,9 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
     elif any(cell.known_targets):
         flange = np.eye(4)
     else:
-        last, remainder = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
-        flange = se3.inverse(links[-1]) @ last @ nominal[-1]
+        flange, links[-2] = drawn_flange(links, nominal)
         targets = se3.product(se3.inverse(flange)[None], targets)
-        links[-2], links[-1] = se3.inverse(remainder), nominal[-1]
+        links[-1] = nominal[-1]
     registered = se3.inverse(base) @ cell.registration
     return RobotFrames(
         base=base,
@@ -95,6 +94,15 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
         constant_effects=within,
         other_effects=beyond,
     )
+
+
+def drawn_flange(links: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """Return T_chainflange_flange of the flange as drawn (4, 4), and the link before joint n then.
+
+    Both `links` (n + 1, 4, 4), those of a fit and the nominal ones, end at their own flange.
+    """
+    last, remainder = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
+    return se3.inverse(links[-1]) @ last @ nominal[-1], se3.inverse(remainder)
 
 
 def whole_turns(model: Model, theta: Floats) -> Bools:
