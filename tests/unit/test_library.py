@@ -254,6 +254,7 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
     served.close()
 
 
+@pytest.mark.long
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined, planned):
     with hc.Campaign.open(site.run, read_only=True) as run:
         found, fit, judged = refined, refined.fit, refined.diagnosis

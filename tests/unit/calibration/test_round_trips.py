@@ -179,6 +179,7 @@ def test_a_wrist_that_has_turned_more_than_once_is_inverted_as_exactly(effect):
     np.testing.assert_allclose(far - turns, near, atol=NM)
 
 
+@pytest.mark.long
 @ROUND
 @given(SEEDS, st.lists(st.sampled_from(EFFECTS), min_size=1, max_size=4, unique=True))
 def test_a_calibration_file_says_the_same_in_every_bit(seed, names):

@@ -73,6 +73,7 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
     assert law.holdout_share > 0.8
 
 
+@pytest.mark.long
 def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypatch):
     before, laws = campaign(LAW), LawSearch(tmp_path, "bent")
     monkeypatch.setattr(

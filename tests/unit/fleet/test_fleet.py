@@ -111,6 +111,7 @@ def test_shrunk_effects_are_pooled_by_what_the_readings_say_of_them(one):
         pool(unnamed, [])
 
 
+@pytest.mark.long
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
     found = with_odd[1]
     assert found.parameters
@@ -129,6 +130,7 @@ def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
     assert not found.wear
 
 
+@pytest.mark.long
 def test_the_prior_of_a_few_arms_is_as_wide_as_their_spread_is_uncertain(one):
     rng, inside = np.random.default_rng(8), []
     for seed in range(18):
@@ -330,6 +332,7 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     assert "No arm is unlike the others\n" in rows(path, "/words/type0", "TextDocument:text")[0][0]
 
 
+@pytest.mark.long
 def test_what_others_imitate_only_far_off_is_known():
     """Geometry imitates a joint's compliance, moved by a thousand times its ordinary magnitude."""
     rng = np.random.default_rng(5)

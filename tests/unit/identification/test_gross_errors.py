@@ -258,7 +258,8 @@ def test_more_than_can_be_told_is_said(mode):
 @pytest.mark.parametrize(
     ("kind", "size", "angle", "every"),
     [("many", 5e-3, lambda q: np.sin(2 * q[:, 0]), False),
-     ("alike", 1e-3, lambda q: np.maximum(np.sin(q[:, 1]), 0.0), True)],
+     pytest.param("alike", 1e-3, lambda q: np.maximum(np.sin(q[:, 1]), 0.0), True,
+                  marks=pytest.mark.long)],
 )  # fmt: skip
 def test_readings_that_follow_the_state_are_not_called_wrong(kind, size, angle, every):
     """A law of one angle, which every reading of a pose has in common."""

@@ -35,6 +35,7 @@ def campaign(seed, hung=1.0, friction=2.0):
     return replace(readings, states=replace(p.states, torque=torque))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_load_that_is_not_what_it_is_said_to_be(seed):
     found = check_torques(cell_of(), campaign(seed, hung=0.49))

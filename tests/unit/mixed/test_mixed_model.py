@@ -146,6 +146,7 @@ def predict(variances, jacobian):
     return x @ variances.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("groups", [8, 12])
 def test_bands_hold_what_they_say_with_few_rows(groups):
     rng = np.random.default_rng(5)
