@@ -48,6 +48,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError, expect
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import derivative
+from hilcal.identification.prediction.other_temperatures import by_other_temperatures
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
     RobotFrames,
@@ -389,7 +390,12 @@ class Calibration(Brief):
             point = (position - tool.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
             isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in unstated)
-            covariance = turn @ (by_parameters + scatter) @ turn.T + isotropic * np.eye(3)
+            of_tool = by_parameters + scatter
+            if self.mode == "absolute":
+                axes = prediction.observation.axes
+                warmer = by_other_temperatures(tool.model, states, self.measured.ranges, 3)
+                of_tool = of_tool + np.swapaxes(axes, 1, 2) @ warmer @ axes
+            covariance = turn @ of_tool @ turn.T + isotropic * np.eye(3)
             offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes
             lever = se3.apply(se3.product(rotation, tool.nominal[:3, :3].T), offset)
             across = np.sum(lever**2, axis=1)[:, None, None] * np.eye(3)

@@ -50,12 +50,13 @@ from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, ran
 from hilcal.identification.gauss_newton import derivative, whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.noise.arm_scatter import with_missing_scatter
+from hilcal.identification.prediction.other_temperatures import by_other_temperatures
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.families import families_of
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import ArmScatter, Readings, ranges_of
+from hilcal.readings.readings import ArmScatter, Range, Readings, ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement
@@ -195,6 +196,7 @@ class Predictive:
     scatter_m2: float  # `scatter` of a 3-D position, m²
     left_out_m2: float  # `left_out` of a 3-D position, m²
     arm_scatter: ArmScatter | None  # the arm's, estimated, which V contains
+    measured: tuple[Range, ...]  # ranges of the fitted readings
 
     def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
         """Return the scaling of other readings, with the arm's estimated scatter in V."""
@@ -203,10 +205,14 @@ class Predictive:
         return whitening(replace(scattered, common=readings.common), mode, "gc")
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
-        """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
+        """Return κ J C Jᵀ (D, m, m) of predicted measurements, and what other temperatures add."""
         jacobian = w.raw(derivative(self.model, prediction, self.theta, w.m, w.mode))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
-        return np.asarray(self.factor * spread)
+        covariance = np.asarray(self.factor * spread)
+        if w.mode == "absolute":
+            states = prediction.situation.states[w.reading]
+            covariance += by_other_temperatures(self.model, states, self.measured, w.m)
+        return covariance
 
     def position_m2(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return tr J C Jᵀ (D,) of predicted 3-D positions, m², as `pose_m2` of the fitted ones."""
@@ -315,6 +321,7 @@ def predictive(
         model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
         open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
         scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
+        ranges_of(fitted.states, model.cell.arm.units),
     )  # fmt: skip
 
 

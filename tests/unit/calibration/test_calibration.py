@@ -278,6 +278,30 @@ def test_the_band_holds_its_share():
         assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
 
 
+def test_temperatures_that_were_not_measured_widen_the_band_by_what_they_do():
+    c = campaign("none", "absolute", 2, poses=20)
+    warm = {"air_temperature": np.full(len(c.readings), 21.0)}
+    readings = replace(c.readings, states=replace(c.readings.states, **warm))
+    calibration = Calibration.of(fit(baseline(c.cell, readings, "absolute"), readings, "absolute"))
+    states = plan(15, 500).states
+    world = replace(c.world, physics=c.world.physics.with_effect("thermal_growth", 12e-6))
+    hot, cold = (
+        world.equilibrium(replace(states, air_temperature=np.full(75, degrees))).flange
+        for degrees in (31.0, 21.0)
+    )
+    moved = ((hot - cold) @ c.cell.target)[:, :3, 3]
+
+    def covariance(degrees):
+        air = {"air_temperature": np.full(75, degrees)}
+        return calibration.predict(states.q, states.wrench, recorded=air).covariance
+
+    np.testing.assert_array_equal(covariance(21.1), covariance(21.0))
+    more = covariance(31.0) - covariance(21.0)
+    assert np.linalg.norm(moved, axis=1).max() > 1e-4
+    share = np.trace(more, axis1=1, axis2=2) / np.sum(moved**2, axis=1)
+    np.testing.assert_allclose(share, 1.0, rtol=0.01)
+
+
 def test_attitudes_do_not_tell_how_the_flange_is_turned_beside_the_target():
     """The turn of one target on the flange is estimated, so that another tool is less certain."""
     c = campaign("link_geometry", "absolute", 2, poses=20, strength=20.0, m=6)
