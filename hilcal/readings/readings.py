@@ -37,6 +37,43 @@ Names = str | int | Iterable[str | int]
 TEMPERATURES = ("air_temperature", "joint_temperature")
 """Columns of `States` that are NaN in readings without them; see `Readings.whole`."""
 SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
+VALID_ROWS = "valid: whole numbers, a slice, (N,) bools, as of readings.where(pose='p3')"
+
+
+class Numbers(np.ndarray):
+    """Numbers (N,) of things that have names; numpy would call every number unequal to a name."""
+
+    def __eq__(self, other: object) -> Any:
+        return super().__eq__(_without_names(other))
+
+    def __ne__(self, other: object) -> Any:
+        return super().__ne__(_without_names(other))
+
+    __hash__ = None  # as of numpy's
+
+
+def _without_names(other: object) -> Any:
+    if np.asarray(other).dtype.kind in "UTO":
+        raise InputError(
+            f"poses, loads and targets are numbers here, not names as {shorten(repr(other), 40)}; "
+            "valid: readings.where(pose='p3'), where(load='5kg'), or a column of to_frame()"
+        )
+    return other
+
+
+def _checked_rows(rows: Rows) -> Ints | Bools | slice:
+    """Return rows as numpy takes them, a single one as an array."""
+    if isinstance(rows, slice):
+        return rows
+    given = np.asarray(rows)
+    chosen = given.astype(int) if given.size == 0 else np.atleast_1d(given)
+    if (
+        chosen.dtype.kind not in "biu"
+        or chosen.ndim > 1
+        or (given.ndim == 0 and given.dtype == bool)
+    ):
+        raise InputError(f"rows {shorten(repr(rows), 60)} of readings; {VALID_ROWS}")
+    return chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +114,7 @@ class States(Brief):
         return len(self.q)
 
     def __getitem__(self, rows: Rows) -> "States":
-        chosen = np.atleast_1d(rows) if isinstance(rows, int | np.integer) else rows
+        chosen = _checked_rows(rows)
         return by_field([self], lambda fields: fields[0][chosen])
 
     @staticmethod
@@ -239,14 +276,17 @@ class Readings(Tabular):
     serial: SerialNoise | None = None
     along: Floats | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("pose", "load"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name)).view(Numbers))
+
     def __len__(self) -> int:
         return len(self.pose)
 
     def __getitem__(self, rows: Rows) -> "Readings":
-        states = self.states[rows]
-        rows = np.atleast_1d(rows) if isinstance(rows, int | np.integer) else rows
-        chosen = by_field([self], lambda fields: fields[0][rows])
-        return replace(chosen, states=states)
+        chosen = _checked_rows(rows)
+        part = by_field([self], lambda fields: fields[0][chosen])
+        return replace(part, states=self.states[chosen])
 
     def where(self, *, pose: Names | None = None, load: Names | None = None) -> Bools:
         """(N,) which readings are of these poses and these loads, by the names of the table.
@@ -376,7 +416,8 @@ class Readings(Tabular):
     def target(self) -> Ints:
         """(N,) number of the target that is read; 0 where there is one."""
         number = self.states.target
-        return np.zeros(len(self), dtype=np.int64) if number is None else number
+        number = np.zeros(len(self), dtype=np.int64) if number is None else number
+        return number.view(Numbers)
 
     @property
     def observer(self) -> Ints:

@@ -331,6 +331,10 @@ def test_readings_are_chosen_by_the_names_of_their_table_and_put_together(site):
     np.testing.assert_array_equal(both, frame["pose"].isin([3, 5]) & (frame["load"] == "none"))
     refusal(r"unknown load '5 kg' \(did you mean \"5kg\"", readings.where, load="5 kg")
     refusal("unknown pose 'p3'.*; valid: 1, 2, 3", readings.where, pose="p3")
+    for names in ("3", ["3"], np.array(["3", "5"])):  # numpy alone would call all of them unequal
+        refusal("numbers here, not names.*where", lambda given=names: readings.pose != given)
+    for rows in (True, "3", None, [0.5]):
+        refusal("rows .* of readings; valid: whole numbers", lambda given=rows: readings[given])
     assert [len(one) for one in readings] == [1] * len(readings)
     again = readings[~test] + readings[test]
     order = np.argsort(test, kind="stable")
