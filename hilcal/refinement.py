@@ -55,7 +55,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.regression.leave_out import improves
-from hilcal.shown import Brief, Shown
+from hilcal.shown import Brief
 from hilcal.store.revision import BACKGROUND, change
 
 MOST_REVISIONS = 15
@@ -94,7 +94,7 @@ class RefinementStep(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refinement(Shown):
+class Refinement(Brief):
     """The steps of a refinement, from the starting model to the last one."""
 
     steps: tuple[RefinementStep, ...]

@@ -15,14 +15,17 @@ MOST_WRITTEN = 7  # numbers of an array that are written out
 
 def brief(value: Any) -> str:
     """Return a dataclass in at most `MOST_LINES` lines: by its `_brief`, else by its fields."""
-    if (describe := getattr(value, "_brief", None)) is not None:
-        texts = describe()
-    else:
-        texts = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
-    lines = [f"  {name}: {text}" for name, text in texts.items()]
+    lines = [f"  {name}: {text}" for name, text in texts_of(value).items()]
     if (hidden := len(lines) - (MOST_LINES - 3)) > 1:
         lines = [*lines[: MOST_LINES - 3], f"  ... and {hidden} more"]
     return "\n".join([f"{type(value).__name__}(", *lines, ")"])
+
+
+def texts_of(value: Any) -> dict[str, str]:
+    """Return what `brief` shows of a dataclass, by name."""
+    if (describe := getattr(value, "_brief", None)) is not None:
+        return dict(describe())
+    return {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
 
 
 def shortened(value: object) -> str:
@@ -54,7 +57,10 @@ def _cut(text: str) -> str:
 
 
 class Brief:
-    """A dataclass whose `repr` is at most `MOST_LINES` lines: its fields, large ones by size."""
+    """A dataclass whose `repr` is at most `MOST_LINES` lines: its fields, large ones by size.
+
+    Notebooks show results as their reports, other values as a table of the same lines.
+    """
 
     __slots__ = ()
 
@@ -63,12 +69,6 @@ class Brief:
         super().__init_subclass__(**options)
         if "__repr__" not in cls.__dict__:
             type.__setattr__(cls, "__repr__", brief)
-
-
-class Shown(Brief):
-    """A value that notebooks show as text and tables."""
-
-    __slots__ = ()
 
     def _repr_html_(self) -> str:
         return str(presenter("notebook").html_of(self))

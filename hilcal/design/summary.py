@@ -30,7 +30,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.route import DryRun, dry_run
 from hilcal.regression.evidence import VISIBLE
 from hilcal.regression.schur import schur_complement
-from hilcal.shown import Brief, Shown, Tabular
+from hilcal.shown import Brief, Tabular
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
@@ -386,7 +386,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CheckedPlan(Shown, Tabular):
+class CheckedPlan(Tabular):
     """A plan whose dry run passed, and its summary."""
 
     plan: Plan  # poses, loads and steps

@@ -30,7 +30,7 @@ from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, with_a
 from hilcal.identification.prediction.validation import Extrapolation, Validation, extrapolation
 from hilcal.identification.residual import error_block
 from hilcal.readings.whitening import Mode
-from hilcal.shown import Brief, Shown
+from hilcal.shown import Brief
 
 MOST_ADDED = 2
 """Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
@@ -58,7 +58,7 @@ class ErrorToday(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison(Shown):
+class Comparison(Brief):
     """An earlier campaign and a later one of the same arm; what `compare` returns.
 
     Attributes:

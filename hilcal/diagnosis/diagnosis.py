@@ -26,7 +26,7 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import ArmScatter
-from hilcal.shown import Shown, Tabular, presenter
+from hilcal.shown import Tabular, presenter
 from hilcal.store.codec import encode
 
 MOST_IN_DOUBT = 4
@@ -89,7 +89,7 @@ class History:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Diagnosis(Shown, Tabular):
+class Diagnosis(Tabular):
     """What is wrong with a fitted model.
 
     Attributes:

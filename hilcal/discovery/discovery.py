@@ -59,7 +59,7 @@ from hilcal.identification.linearisation import by_pose, left_out_by_pose, linea
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import score_family
 from hilcal.regression.leave_out import improves
-from hilcal.shown import Shown
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file, spare_other
 
@@ -88,7 +88,7 @@ class FoldSearch:
 
 
 @dataclass(frozen=True, eq=False)
-class Discovery(Shown):
+class Discovery(Brief):
     """Result of the search for laws."""
 
     fit: Fit  # whose misfit is explained

@@ -32,7 +32,7 @@ from hilcal.identification.gauss_newton import solve
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Scaling, whitening
-from hilcal.shown import Shown
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 LEVEL = 0.95  # of the percentile interval, unless another is asked for
@@ -43,7 +43,7 @@ DRAWS_PER_TASK = 5  # draws that a worker makes at a time, on any number of work
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap(Shown):
+class Bootstrap(Brief):
     """Parameters of a model, fitted to B draws of whole poses.
 
     Attributes:

@@ -24,7 +24,7 @@ from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Scaling, Whitening, whitening, whitening_matrix
 from hilcal.robot.arm import array_of
-from hilcal.shown import Tabular
+from hilcal.shown import Brief, Tabular
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
@@ -61,7 +61,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimates(Sequence[Estimate]):
+class Estimates(Brief, Sequence[Estimate]):
     """The fitted parameters, in the order of the model, without those of dropped groups."""
 
     rows: tuple[Estimate, ...]

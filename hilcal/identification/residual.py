@@ -9,7 +9,7 @@ from hilcal.model.model import Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, measured_values, relative_rotation
 from hilcal.robot import se3
-from hilcal.shown import Shown
+from hilcal.shown import Brief
 from hilcal.types import Floats
 
 CONFIDENCE = 0.95
@@ -68,7 +68,7 @@ def noise_floor(covariance: Floats) -> float:
     return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))))
 
 
-class WithVarianceFactor(Shown):
+class WithVarianceFactor(Brief):
     """Base of classes with a whitened sum of squares and its degrees of freedom."""
 
     __slots__ = ()

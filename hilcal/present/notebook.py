@@ -5,13 +5,14 @@ from collections.abc import Iterable, Iterator
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
+from hilcal import numbers
 from hilcal.calibration.compensation import Compensation
 from hilcal.design.summary import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery
 from hilcal.identification.bootstrap import Bootstrap
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Estimates, Fit
 from hilcal.identification.prediction.full_prediction import residual_table
 from hilcal.identification.prediction.validation import CampaignValidation
 from hilcal.optional import needed_by
@@ -23,13 +24,14 @@ from hilcal.present.calibration import (
     validation_report,
 )
 from hilcal.present.comparison import comparison_report
-from hilcal.present.document import Block
-from hilcal.present.fit import fit_report, stream_report
+from hilcal.present.document import Block, heading, pairs, table
+from hilcal.present.fit import PARAMETER_COLUMNS, fit_report, stream_report
 from hilcal.present.plan import plan_report
 from hilcal.present.story import chapters_of, errors_by_revision
 from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement
+from hilcal.shown import texts_of
 from hilcal.stream import StreamFit
 from hilcal.tables.table import covers_with_rounding, exchange_columns
 from hilcal.tables.write import plan_csv
@@ -47,7 +49,7 @@ def html_of(value: object) -> str:
 
 @singledispatch
 def _blocks(value: object) -> Iterable[Block]:
-    raise TypeError(f"there is no report of a {type(value).__name__}")
+    return heading(type(value).__name__), pairs(texts_of(value).items())
 
 
 _blocks.register(Fit, lambda fit: fit_report(fit, details=False))
@@ -66,6 +68,17 @@ def _(tested: CampaignValidation) -> Iterator[Block]:
     yield from fit_and_test_lines(tested.judged, tested.prediction)
     yield from validation_report(tested.judged, tested.prediction, tested.beyond)
     yield from shares_report(tested.shares)
+
+
+@_blocks.register
+def _(estimates: Estimates) -> Iterator[Block]:
+    out = table(*PARAMETER_COLUMNS[:-1], left=(0, 3), caption="parameters")
+    for e in estimates:
+        shown = "not determined", "", e.unit
+        if e.value is not None and e.std is not None:
+            shown = numbers.measured(e.unit, e.value, e.std)
+        out.add(e.name, *shown)
+    yield out
 
 
 @_blocks.register

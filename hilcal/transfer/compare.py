@@ -51,7 +51,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted
 from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.factory import FactoryKinematics, with_factory
-from hilcal.shown import Shown
+from hilcal.shown import Brief
 from hilcal.store.revision import CARRIED, RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Bools
@@ -299,7 +299,7 @@ def _tool_differs(first: Campaign, second: Campaign) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FactoryCheck(Shown):
+class FactoryCheck(Brief):
     """Result of the test."""
 
     changed: bool  # whether the geometry differs from the factory's

@@ -25,7 +25,7 @@ from hilcal.identification.residual import ErrorBlock, error_block, noise_floor,
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings, ranges_of, turning_variables, variables
 from hilcal.readings.whitening import Mode, Whitening, whitening, whitening_matrix
-from hilcal.shown import Brief, Shown
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 STEPS = 10  # most Gauss-Newton steps of a registration; a choice
@@ -384,7 +384,7 @@ class Acceptance(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CampaignValidation(Shown):
+class CampaignValidation(Brief):
     """Readings of another campaign against a revision."""
 
     model: Model  # of the revision

@@ -223,6 +223,9 @@ def test_results_show_themselves_in_a_notebook(made):
             (m.diagnosis, m.diagnosis.suspects[0].effect),
             (path_of, m.diagnosis.verdict.replace("_", " ")),
             (run, "readings of"),
+            (run.readings, f"{len(run.readings)}, of positions"),
+            (m.fit.parameters, m.fit.parameters[0].name),
+            (run.cell, "arm"),
         ):
             shown = result._repr_html_()
             tags = Outline(shown).tags
