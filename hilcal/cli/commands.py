@@ -59,7 +59,8 @@ report | showing
 view | showing | Show the readings and revisions of a campaign in the rerun viewer.
 export | exporting | Write readings, parameters, calibration, URDF, DH table or frames to files.
 Look up:
-effects | looking_up | List the effects that a model can have; `new` writes a file for one of yours.
+effects | looking_up
+    | List the effects that a model can have, or describe one; `new` writes a file for one of yours.
 study | | Run numerical studies of the methods.
 doctor | preparing
     | Check packages, ports, permissions, network, clock and disk of this computer.
@@ -83,7 +84,11 @@ def load(place: str) -> Callable[..., Any]:
     return function
 
 
-_BELOW = {"effects": (("new", "looking_up:new"),), "study": (("scaling", "looking_up:scaling"),)}
+SHOW = "show"  # the subcommand that a name which is no subcommand is given to
+_BELOW = {
+    "effects": (("new", "looking_up:new"), (SHOW, "looking_up:show")),
+    "study": (("scaling", "looking_up:scaling"),),
+}
 
 
 def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
@@ -121,6 +126,11 @@ class CommandGroup(TyperGroup):
     """A group whose help has the full summary of each command, wrapped between words."""
 
     sections: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  (replaced, never changed)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command; a group that can show something takes any other word for its name."""
+        shows = SHOW in self.commands and args[0] not in self.commands
+        return super().resolve_command(ctx, [SHOW, *args] if shows else args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, under headings where there are any."""

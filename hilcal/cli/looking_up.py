@@ -1,5 +1,6 @@
 """`effects`, `config`, `study`: the catalogue, the keys of a cell, studies of scaling."""
 
+import inspect
 import keyword
 import re
 from dataclasses import asdict
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
+from hilcal import numbers
 from hilcal.cli.options import catalogue_with, check_seed, command, one_by_default
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import reference
@@ -26,7 +28,7 @@ from hilcal.identification.fit_document import with_nulls
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.campaign import section_report, sections_overview
-from hilcal.present.document import note, table
+from hilcal.present.document import heading, note, table
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file
@@ -40,8 +42,10 @@ OPTIONS_NOTE = (
 def effects(
     ctx: typer.Context, effects_from: list[Path] | None = None, as_json: bool = False
 ) -> None:
-    """List the effects that a model can have; `new` writes a file for one of yours."""
+    """List the effects that a model can have, or describe one; `new` writes a file."""
     if ctx.invoked_subcommand is not None:
+        if as_json or effects_from:
+            raise InputError("options of one effect stand behind its name: hilcal effects NAME ...")
         return
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     cell, rail = example_cell(), example_cell(slides=True)
@@ -73,6 +77,35 @@ def effects(
         notes.append(f"from {file.path}: {', '.join(e.name for e in file.effects)}")
     t.show([out, note("\n".join([*notes, OPTIONS_NOTE]))])
     t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in instances]})
+
+
+@command("""
+    name | EFFECT | Name of the effect.
+    """)
+def show(t: Terminal, name: str, catalogue: Catalogue) -> None:
+    """Describe one effect: law, parameters with ordinary sizes, what it needs, options."""
+    kind, cell = catalogue[name], example_cell()
+    cell = cell if kind.applies(cell) else example_cell(slides=True)
+    states = example_states(cell)
+    e = kind(cell, states)
+    rows = ((p.name, *numbers.measured(p.unit, p.scale)[::2], p.meaning) for p in e.parameters)
+    facts = [
+        f"The readings must have {' and '.join(e.needs)}." * bool(e.needs),
+        "It depends on the forces in the arm: loads, or poses in which it bears other torques, "
+        "show it." * e.elastic,
+        _expected(e).removeprefix("; ").capitalize() + ", as a standard deviation before anything "
+        "is measured."
+        if expected_sizes(e)
+        else "",
+        f"A suspect of more than {e.most():g} times the ordinary sizes is not named."
+        * bool(np.isfinite(e.most())),
+    ]
+    t.show(heading(e.name))
+    t.show([e.summary, "", inspect.getdoc(kind) or "", ""])
+    t.show(table("parameter", "ordinary size", "unit", "meaning", rows=rows, left=(0, 2, 3)))
+    t.show([f"parameters: of a {cell.arm.name}", *filter(None, facts)])
+    t.show(f"option {option}: {meaning}" for option, meaning in e.option_help.items())
+    t.document({"effects": [_document(e, option_defaults(kind, cell, states), catalogue)]})
 
 
 def _expected(e: Effect) -> str:

@@ -245,6 +245,19 @@ def test_new_writes_an_effect_that_works(tmp_path, capsys):
         assert word in content
 
 
+def test_the_name_of_an_effect_shows_this_one(capsys):
+    shown = ok(capsys, "effects", "creep").out
+    for words in ("τ_j log10(1 + t/1 s)", "creep of all joints per decade", "load_time", "0.01"):
+        assert words in shown
+    assert [e["name"] for e in ok(capsys, "effects", "creep", "--json").document["effects"]] == [
+        "creep"
+    ]
+    assert 'did you mean "creep"' in refused(capsys, 2, "effects", "crep")
+    assert "stand behind its name" in refused(
+        capsys, 2, "effects", "--effects-from", "mine.py", "creep"
+    )
+
+
 def test_new_goes_into_the_folder_one_is_in(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "soft_side.py" in ok(capsys, "effects", "new", NAME).out
