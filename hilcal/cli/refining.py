@@ -13,7 +13,7 @@ from hilcal.cli import fitting
 from hilcal.cli.options import check_output, command
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal
-from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
+from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NO_HISTORY
@@ -80,41 +80,14 @@ def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None 
         fitting.compute_errors(fitted, say)
     t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
-    _show_next_command(t, catalogue, run, revision, d)
+    _show_next_command(t, run, revision, d)
     t.document({"revision": number, **d.to_dict()})
 
 
-def _show_next_command(
-    t: Terminal, catalogue: Catalogue, run: Path, revision: int | None, d: Diagnosis
-) -> None:
+def _show_next_command(t: Terminal, run: Path, revision: int | None, d: Diagnosis) -> None:
     """Print the command that adds what is missing, searches for it, or plans what tells more."""
-    doubt = in_doubt(d)
-    if d.verdict == "missing_effect" and d.lead is not None:
-        doubt, what = (d.lead.effect,), "To add it, and see the error before and after:"
-        line = ["hilcal", "add", quoted(run), quoted(d.lead.effect)]
-    elif doubt:
-        what = "To plan the measurements that separate them:"
-        line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
-    elif d.reason in ("background", "few_readings", "unconfirmed_suspect"):
-        what = "To plan further poses:"
-        line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run)]
-    elif d.reason in ("no_suspect", "insufficient_catalogue") and d.step is None:
-        what = "To search for the law of what is missing:"
-        names = itertools.chain(["law"], (f"law_{k}" for k in itertools.count(2)))
-        new = next(name for name in names if name not in catalogue.names)
-        line = ["hilcal", "discover", quoted(run), "-o", f"{new}.py"]
-    else:
-        return
-    line += [] if revision is None else ["--revision", str(revision)]
-    t.show(what)
-    t.command(" ".join([*line, *_effect_files(catalogue, (*d.fit.model.names, *doubt))]))
-
-
-def _effect_files(catalogue: Catalogue, names: Iterable[str]) -> list[str]:
-    """Return the options that give a command the files of effects."""
-    files = (catalogue.file_of(name) for name in names)
-    paths = dict.fromkeys(f.path for f in files if f is not None)
-    return [word for path in paths for word in ("--effects-from", quoted(path))]
+    for line, show in zip(words.next_command(d, run, revision), (t.show, t.command), strict=False):
+        show(line)
 
 
 @command("""
@@ -279,7 +252,7 @@ def refine(
         if diagnosis.verdict != "adequate" and laws is None:
             in_use = o.in_use()
             same = in_use is not None and in_use.number == numbered[-1]
-            _show_next_command(t, catalogue, run, None if same else numbered[-1], diagnosis)
+            _show_next_command(t, run, None if same else numbered[-1], diagnosis)
         if live is not None:  # verdicts may have changed when further effects were tried
             for chapter in chapters:
                 live.revised(chapter)
@@ -368,7 +341,7 @@ def discover(
     t.show(
         f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
     )
-    known = " ".join(["", *_effect_files(catalogue, fitted.model.names)])
+    known = " ".join(["", *words.effect_files(catalogue, fitted.model.names)])
     base = "" if revision is None else f" --revision {revision}"
     law = f"{known} --effects-from {quoted(output)}"
     t.command(f"hilcal add {quoted(run)} {name}{base}{law}")

@@ -1,12 +1,14 @@
 """Reports of diagnoses, revisions and laws: suspects, detectable effects, curves."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilcal import numbers
-from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import FEWEST_POSES
 from hilcal.diagnosis.noise import PureError
@@ -16,7 +18,9 @@ from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.search import pareto
+from hilcal.effects.catalogue import Catalogue
 from hilcal.identification.fit import Fit
+from hilcal.names import quoted
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import (
@@ -416,3 +420,36 @@ def refined_laws(s: LawSearch) -> Iterator[Block]:
                 f"It is stored as the effect {law.name} in {s.files[law.name]}; commands that read "
                 "these revisions need it: --effects-from.\n"
             )
+
+
+def next_command(d: Diagnosis, run: Path, revision: int | None) -> tuple[str, str] | tuple[()]:
+    """Return the command that adds what is missing, searches for it, or plans what tells more.
+
+    A sentence and the command; nothing where there is nothing to do.
+    """
+    doubt, catalogue = in_doubt(d), d.fit.model.catalogue
+    if d.verdict == "missing_effect" and d.lead is not None:
+        doubt, what = (d.lead.effect,), "To add it, and see the error before and after:"
+        line = ["hilcal", "add", quoted(run), quoted(d.lead.effect)]
+    elif doubt:
+        what = "To plan the measurements that separate them:"
+        line = ["hilcal", "next", quoted(run), "-o", "PLAN.json"]
+    elif d.reason in ("background", "few_readings", "unconfirmed_suspect"):
+        what = "To plan further poses:"
+        line = ["hilcal", "plan", "CELL.toml", "-o", "PLAN.json", "--after", quoted(run)]
+    elif d.reason in ("no_suspect", "insufficient_catalogue") and d.step is None:
+        what = "To search for the law of what is missing:"
+        names = itertools.chain(["law"], (f"law_{k}" for k in itertools.count(2)))
+        new = next(name for name in names if name not in catalogue.names)
+        line = ["hilcal", "discover", quoted(run), "-o", f"{new}.py"]
+    else:
+        return ()
+    line += [] if revision is None else ["--revision", str(revision)]
+    return what, " ".join([*line, *effect_files(catalogue, (*d.fit.model.names, *doubt))])
+
+
+def effect_files(catalogue: Catalogue, names: Iterable[str]) -> list[str]:
+    """Return the options that give a command the files of effects."""
+    files = (catalogue.file_of(name) for name in names)
+    paths = dict.fromkeys(f.path for f in files if f is not None)
+    return [word for path in paths for word in ("--effects-from", quoted(path))]

@@ -18,7 +18,7 @@ from hilcal.diagnosis.recorded import Difference
 from hilcal.names import escaped
 from hilcal.present import charts
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
-from hilcal.present.diagnosis import ORDER, shown_suspects, suspects_table
+from hilcal.present.diagnosis import ORDER, next_command, shown_suspects, suspects_table
 from hilcal.present.document import Table, description_of, load_name
 from hilcal.present.document import table as block
 from hilcal.present.fit import dependence_sentence, holdout_sentence, model_name
@@ -102,6 +102,9 @@ def _verdict(view: View, d: Snapshot) -> None:
         text = plain(numbers.sentence(headline(judged)))
         ui.html(f"<h2 class='verdict {kind}'>{mark} {text}</h2>", sanitize=False)
         ui.label(message(judged))
+        if judged.verdict not in ("missing_effect", "ambiguous"):  # for these the page has buttons
+            for line in next_command(judged, view.session.path, d.number):
+                ui.label(line).classes("code" * line.startswith("hilcal "))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
             for name, value in (

@@ -69,6 +69,8 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(session, reas
             assert found == [judged.verdict]
             assert "is needed" not in said
             assert "nothing is missing" not in said
+            law = [f"hilcal discover {shown.path} -o law.py"]
+            assert seen(user, ui.label, "code") == law * (reason == "no_suspect")
 
     simulated(look)
 
