@@ -48,6 +48,9 @@ MOST_DEGREES = 400.0  # largest joint angle of a table, a turn and some margin; 
 RECENT = 1e8  # s since 1970; later times are of a campaign. A choice
 _EXCEL = (30000.0, 60000.0)
 
+SAME_TARGET_M = 2e-3  # m, within which readings side by side are of one target; a choice
+REPEATED = "repeats of one target side by side, since they agree within 2 mm"
+
 
 def is_quaternion(values: Floats) -> bool:
     """Whether (N, 4) numbers are quaternions: some rows are complete, and these have length 1."""
@@ -261,9 +264,12 @@ def guess_axes(g: words.Guesser) -> None:
     unit = words.length_unit(g, "position", names)
     if len(used) > 1:
         targets = [str(s[-1]) for s in used]
-        meaning = f"{unit}, {len(targets)} targets"
+        apart = LENGTHS[unit] * np.ptp(g.block(names).reshape(-1, len(used), 3), axis=1)
+        one = float(np.nanmax(apart)) < SAME_TARGET_M
+        targets = [""] * len(used) if one else targets
+        meaning = f"{unit}, {len(targets)} {'repeats' if one else 'targets'}"
         g.assign("position", names, meaning, unit=unit, targets=targets)
-        g.doubt("position", words.SIDE_BY_SIDE)
+        g.doubt("position", REPEATED if one else words.SIDE_BY_SIDE)
     else:
         g.assign("position", names, unit, unit=unit)
     others = [s for s in ranked if s not in used and words.NOMINAL.isdisjoint(map(str, s))]

@@ -48,6 +48,7 @@ def import_readings(
     stated = exchange.FROM_TRACKER not in result.notes
     covers = INSTRUMENT_AND_ARM if stated and config.repeatability.in_tables else result.covers
     readings, copies = exchange.without_copies(result.readings)
+    means = exchange.means_noted(readings)
     # an arm's scatter in the covariances is the same in all samples of a standstill
     share = config.acquire.systematic_share if covers == INSTRUMENT else 1.0
     readings, averaged = averaged_samples(readings, share)
@@ -57,7 +58,7 @@ def import_readings(
     named = (*named, *_forces_of_flange(readings, arm), *_weight_of_tool(readings, weight))
     return exchange.ImportResult(
         readings,
-        (*notes, *copies, *averaged, *named),
+        (*notes, *copies, *means, *averaged, *named),
         covers,
         stated or tracker.states_noise,
         not stated,

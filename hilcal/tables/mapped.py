@@ -205,8 +205,10 @@ def one_target_per_row(grid: Grid, mapping: forms.M) -> tuple[Grid, forms.M]:
     targets = mapping.position.targets
     count = len(targets)
     tall = grid.rows_with(np.repeat(np.arange(len(rows)), count))
-    tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
-    update: dict[str, object] = {"target": forms.Name(column=TARGET)}
+    update: dict[str, object] = {}
+    if any(targets):  # without names: repeats of the only one
+        tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
+        update = {"target": forms.Name(column=TARGET)}
     sections: dict[str, forms.Position | forms.Std] = {"position": mapping.position}
     if mapping.std is not None and len(mapping.std.columns) == 3 * count:
         sections |= {"std": mapping.std}

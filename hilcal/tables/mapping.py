@@ -116,7 +116,9 @@ class Position(Section):
     )
     unit: Length = Field(description=_LENGTH)
     targets: tuple[str, ...] = Field(
-        (), description="names of the targets whose positions stand side by side in a row"
+        (),
+        description="names of the targets whose positions stand side by side in a row; empty "
+        "names for repeats of the only one",
     )
 
     @model_validator(mode="after")

@@ -18,7 +18,7 @@ from hilcal.readings.covariance import (
     smallest_correlation,
     tracker_covariance,
 )
-from hilcal.readings.readings import TEMPERATURES, ObserverName, Readings, States
+from hilcal.readings.readings import TEMPERATURES, ObserverName, Readings, States, numbered
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables import columns
@@ -392,6 +392,9 @@ def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple
     return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 
+MEANT_APART, FEWEST_MEANS = 10.0, 3  # last digits that repeats are apart; rows; choices
+
+
 def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
     """Leave out rows that are copies of another row to the last digit, with a note.
 
@@ -424,6 +427,28 @@ def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
         "take them out of the table"
     )
     return readings[~copied], (note,)
+
+
+def means_noted(readings: Readings) -> tuple[str, ...]:
+    """Note rows that are the mean of the other rows of their state: they count twice."""
+    value = readings.value[:, :3]
+    state = numbered(readings.pose, readings.load, readings.cycle, readings.line)
+    size = np.bincount(state)[state][:, None]
+    total = np.stack([np.bincount(state, x)[state] for x in value.T], axis=1)
+    last_digit = np.sqrt(12.0 * rounding_variance(value, 1.0)) + 1e-9
+    off = np.abs(value - total / size) / last_digit  # from the mean of all
+    scattered = np.zeros(state.max() + 1)
+    np.maximum.at(scattered, state, off.max(axis=1))
+    mean = (size[:, 0] > 2) & np.all(off <= 1.0, axis=1) & (scattered[state] > MEANT_APART)
+    states = len(np.unique(state[size[:, 0] > 2]))
+    if mean.sum() < FEWEST_MEANS or 2 * len(np.unique(state[mean])) < states:
+        return ()
+    k = int(np.argmax(mean))
+    name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+    return (
+        f"{int(mean.sum())} of {len(mean)} rows are the mean of the others of their state (the "
+        f"first is of {name}): what was measured counts twice; take them out of the table",
+    )
 
 
 def write_table(

@@ -225,6 +225,40 @@ def test_copied_rows_are_said_and_counted_once(tmp_path, capsys):
     assert "5 of 18 rows are copies of others to the last digit (the first is of P0/5kg)" in said
 
 
+def test_repeats_side_by_side_are_of_one_target(tmp_path, capsys):
+    """`--preview` says so, since they agree; reflectors are further apart."""
+    names = [f"{axis}{k}" for k in (1, 2) for axis in "xyz"]
+    q, cell = np.rad2deg(C.q), tmp_path / "CELL.toml"
+    cell.write_text('[robot]\nmodel = "ur10e"\n')
+    for off, said in ((1e-2, "repeats of one target"), (50.0, "several targets")):
+        table = lines([*NAMES, *names], q, 1e3 * C.position, 1e3 * C.position + off)
+        path, to = write(tmp_path / "t.csv", table), tmp_path / "m.toml"
+        preview = ("import", path, "--preview", "--config", cell, "-o", to, "--force")
+        assert said in ok(capsys, *preview).out
+        if said.startswith("repeats"):
+            out = tmp_path / "run.hilcal"
+            given = ("import", path, "--config", cell, "--format", to, "-o", out, "--json")
+            assert ok(capsys, *given).document["n_readings"] == 24
+
+
+def test_rows_that_are_means_of_others_are_said(tmp_path, capsys):
+    """Three repeats of each pose and their mean, as sheets have them; the repeats alone pass."""
+    name, *rows = GOOD.splitlines()
+    rng, place = np.random.default_rng(1), slice(HEADER.index("X"), HEADER.index("Z") + 1)
+    out = []
+    for row in rows:
+        cells = row.split(";")
+        repeats = np.array(cells[place], dtype=float) + 0.01 * rng.standard_normal((3, 3))
+        for position in (*repeats, repeats.mean(axis=0)):
+            cells[place] = [f"{x:.4f}" for x in position]
+            out.append(";".join(cells))
+    said = "12 of 48 rows are the mean of the others of their state (the first is of P0/5kg)"
+    assert said in " ".join(imported(capsys, tmp_path, "\n".join([name, *out]) + "\n")["notes"])
+    alone = [row for k, row in enumerate(out) if k % 4 != 3]
+    d = imported(capsys, tmp_path, "\n".join([name, *alone]) + "\n")
+    assert "mean of the others" not in " ".join(d["notes"])
+
+
 def test_the_same_table_with_all_that_is_in_the_wild(tmp_path, capsys):
     imported(capsys, tmp_path, GOOD)
     plain = values(tmp_path)

@@ -153,7 +153,7 @@ def _preview(table: Path, cell: Cell | None, second: Path | None) -> Preview:
 def _name_targets(proposal: Proposal, names: list[str]) -> None:
     """Give targets that stand side by side the cell's names, in its order."""
     section = proposal.sections.get("position", {})
-    if names and len(names) == len(section.get("targets", ())):
+    if names and len(names) == sum(map(bool, section.get("targets", ()))):
         section["targets"] = names
         note = f"the targets are {', '.join(names)}, in the cell's order"
         doubts = [doubt for doubt in proposal.doubts if doubt != ("position", SIDE_BY_SIDE)]
