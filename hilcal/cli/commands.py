@@ -60,7 +60,7 @@ view | showing | Show the readings and revisions of a campaign in the rerun view
 export | exporting | Write readings, parameters, calibration, URDF, DH table or frames to files.
 Look up:
 effects | looking_up
-    | List the effects that a model can have, or describe one; `new` writes a file for one of yours.
+    | List the effects that a model can have, or describe one; `new` writes a file for yours.
 study | | Run numerical studies of the methods.
 doctor | preparing
     | Check packages, ports, permissions, network, clock and disk of this computer.

@@ -42,7 +42,7 @@ OPTIONS_NOTE = (
 def effects(
     ctx: typer.Context, effects_from: list[Path] | None = None, as_json: bool = False
 ) -> None:
-    """List the effects that a model can have, or describe one; `new` writes a file."""
+    """List the effects that a model can have, or describe one; `new` writes a file for yours."""
     if ctx.invoked_subcommand is not None:
         if as_json or effects_from:
             raise InputError("options of one effect stand behind its name: hilcal effects NAME ...")

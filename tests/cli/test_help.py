@@ -71,7 +71,7 @@ def test_a_shell_completes_commands_and_options(capsys, monkeypatch):
     assert completed("hilcal di", 1) == ["diagnose", "discover"]
     assert {"demo", "run", "refine"} <= set(completed("hilcal ", 1))
     assert completed("hilcal run --re", 2) == ["--resume", "--rehearse"]
-    assert completed("hilcal effects ", 2) == ["new"]
+    assert completed("hilcal effects ", 2) == ["new", "show"]
     assert completed("hilcal run ce", 2) == []  # a file: the shell's own business
     assert completed("hilcal run 'ce", 2) == []  # a quote that is still open
 
