@@ -109,7 +109,8 @@ def import_(
         noise=None if noise is None else asdict(noise),
         notes=list(notes),
         description=None if misdescription is None else misdescription.to_json(cell, readings),
-        computed_positions=misdescription is not None and misdescription.computed,
+        computed_positions=misdescription is not None
+        and (misdescription.computed or misdescription.too_exact),
         other_arm=None if likely_arm is None else likely_arm.to_json(),
         torques=None if torques is None else torques.to_json(),
         frames=None if registered is None else registered.to_json(),

@@ -43,9 +43,11 @@ from hilcal.identification.registration.placement import (
     minimise,
 )
 from hilcal.identification.registration.registration import (
+    LEAST_SCATTER_M,
     Registration,
     computed_from_joints,
     register,
+    scatters_less_than_arms,
 )
 from hilcal.identification.residual import noise_floor
 from hilcal.numbers import length
@@ -107,6 +109,7 @@ class DescriptionFinding:
     moved: int = 0  # first reading from another place of the tracker, where that explains them
     tried: int = 0  # number of descriptions that were tried
     computed: bool = False  # the positions are computed from the joint values, not measured
+    too_exact: bool = False  # the positions scatter by less than those of any arm
     apart: tuple[int, int] | None = None  # two readings of one state, where such are far apart
 
     @property
@@ -115,6 +118,8 @@ class DescriptionFinding:
 
         Below the gate the zero of a joint is something that effects can estimate.
         """
+        if self.too_exact:
+            return False  # somebody simulates without noise
         zeros = all(e.changes[0].is_zero and len(e.changes) == 1 for e in self.explanations)
         return self.computed or self.apart is not None or self.rms > self.gate or not zeros
 
@@ -126,6 +131,13 @@ class DescriptionFinding:
                 "these positions seem to be computed from the joint values, not measured: the "
                 f"nominal arm leaves {size} rms, which is their rounding. Take the columns of what "
                 "the tracker measured; if these are, write more digits"
+            )
+        if self.too_exact:
+            return (
+                "these positions are no measurements, it seems, but desired or computed ones, or "
+                "simulated without noise: an arm of slightly other lengths leaves less than "
+                f"{length(LEAST_SCATTER_M)} of them, and no arm repeats to that. What is fitted to "
+                "them says nothing of an arm; take the columns of what the tracker measured"
             )
         if self.moved:
             last, first = (self._name(readings, self.moved + k) for k in (-1, 0))
@@ -202,7 +214,7 @@ class DescriptionFinding:
             "rows": np.flatnonzero(self.rows).tolist(),
             "swapped": [list(pair) for pair in self.swapped],
             "moved": self.moved,
-            "computed": self.computed,
+            "computed": self.computed or self.too_exact,
             "apart": None if self.apart is None else list(self.apart),
             "tried": self.tried,
         }
@@ -221,7 +233,19 @@ def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
 
 def examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
     """Return what is wrong with the description, by the registered nominal arm; or None."""
-    cell, gate = registered.cell, max(GATE_M, GATE_REACH * registered.cell.arm.reach)
+    finding = _examine(registered, readings)
+    if finding is None and scatters_less_than_arms(registered, readings):
+        none = np.zeros_like(registered.far)
+        return DescriptionFinding(registered.rms, _gate(registered), (), none, too_exact=True)
+    return finding
+
+
+def _gate(registered: Registration) -> float:
+    return max(GATE_M, GATE_REACH * registered.cell.arm.reach)
+
+
+def _examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
+    cell, gate = registered.cell, _gate(registered)
     # A known base shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     far, rms, noise = registered.far, _size(registered.residual), noise_floor(readings.covariance)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from hilcal.cell import Cell
 from hilcal.effects.target_offset import TargetOffset
@@ -56,7 +57,8 @@ LEAST_TURN = 1e-3  # range of a joint's angle, rad, below which it counts as nev
 LEAST_COMPONENT = 0.05  # component of an undetermined direction that is worth mentioning
 COMPUTED = 1.2  # times the rounding of positions and joints that computed positions may be off
 EXACT = 1e-6  # share of the reach by which two programs compute one position differently
-FEWEST_FREE = 15  # elements beyond the 9 unknown places of base and target that tell so
+LEAST_SCATTER_M = 2e-6  # m, 3-D; no arm repeats to this, and an instrument adds its own; a choice
+FEWEST_FREE = 15  # elements beyond the unknowns that tell so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,17 +181,49 @@ def computed_from_joints(registered: Registration, readings: Readings) -> bool:
 
     J_i being the Jacobian of the target's position. The errors of a real arm are far larger.
     """
-    cell, arm, near = registered.cell, registered.cell.arm, ~registered.far
-    if cell.observers or 3 * np.count_nonzero(near) < 9 + FEWEST_FREE:
+    near = ~registered.far
+    if registered.cell.observers or 3 * np.count_nonzero(near) < 9 + FEWEST_FREE:
         return False
-    q, chain = angles(readings), evaluate(arm, angles(readings))
-    points = FrameData.of(arm, readings).points(given_and_free(cell, readings.m == 6)[0])
-    steps = [max(step(x), np.radians(step(np.degrees(x)))) for x in q.T]
-    of_joints = np.sum((joint_jacobian(chain, points)[:, :3] * steps) ** 2, axis=(1, 2))
-    of_positions = sum(step(x) ** 2 for x in readings.value[:, :3].T)
-    variance = (of_joints + of_positions) / 12 + (EXACT * arm.reach) ** 2
+    variance = _rounding(registered, readings) + (EXACT * registered.cell.arm.reach) ** 2
     square = np.sum(registered.residual[near, :3] ** 2)
     return bool(square <= COMPUTED**2 * np.sum(variance[near]))
+
+
+def scatters_less_than_arms(registered: Registration, readings: Readings) -> bool:
+    """Whether positions scatter by less than any arm about an arm of somewhat other geometry.
+
+    Small motions of all links are fitted to the residual of the nominal arm. With R what they
+    leave, ν its degrees of freedom and Δ² the variance by rounding, it is certain at 99 % that
+
+        σ² = 3 R / χ²(1 %, ν) − Δ² < LEAST_SCATTER²      (3-D, per reading).
+    """
+    cell, residual = registered.cell, registered.residual[:, :3]
+    if cell.observers or registered.far.any():
+        return False
+    chain = evaluate(cell.arm, angles(readings))
+    points = FrameData.of(cell.arm, readings).points(given_and_free(cell, readings.m == 6)[0])
+    turns = chain.rotation  # (L, N, 3, 3)
+    arms = (points - chain.position)[..., None]
+    moved = np.concatenate([turns, np.cross(turns, arms, axis=2)], axis=3)
+    columns = np.moveaxis(moved, 0, 2).reshape(len(points) * 3, -1)
+    rank = np.linalg.matrix_rank(columns)
+    free = residual.size - rank
+    if free < FEWEST_FREE:
+        return False
+    measured = (residual @ cell.registration[:3, :3]).reshape(-1)
+    left = measured - columns @ np.linalg.lstsq(columns, measured)[0]
+    most = 3.0 * float(left @ left) / scipy.stats.chi2.ppf(0.01, free)
+    return bool(most - np.mean(_rounding(registered, readings)) < LEAST_SCATTER_M**2)
+
+
+def _rounding(registered: Registration, readings: Readings) -> Floats:
+    """(N,) variance of the 3-D position by the rounding of positions and joint values, m²."""
+    cell, q, arm = registered.cell, angles(readings), registered.cell.arm
+    points = FrameData.of(arm, readings).points(given_and_free(cell, readings.m == 6)[0])
+    steps = [max(step(x), np.radians(step(np.degrees(x)))) for x in q.T]
+    jacobian = joint_jacobian(evaluate(arm, q), points)[:, :3]
+    of_positions = sum(step(x) ** 2 for x in readings.value[:, :3].T)
+    return np.asarray((np.sum((jacobian * steps) ** 2, axis=(1, 2)) + of_positions) / 12)
 
 
 def _refuse_few(cell: Cell, readings: Readings) -> None:

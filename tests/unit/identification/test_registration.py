@@ -330,6 +330,18 @@ def test_one_joint_in_another_unit_is_named():
     assert "joint 1's values alone are as described: the others are radians" in said
 
 
+@pytest.mark.parametrize(("noise_m", "digits", "said"), [(0, 6, 1), (2e-5, 9, 0), (0, 4, 0)])
+def test_positions_that_scatter_less_than_any_arm_are_no_measurements(noise_m, digits, said):
+    """Desired ones, by other link lengths than the nominal; said, but not refused."""
+    good = of_arm()
+    arm = replace(CELL.arm, links=CELL.arm.links * [1, 1, 1, 1.0001])
+    value = read(arm, good.states.q, BASE, pose_of(np.eye(3), OFFSET), 3)
+    value = value + noise_m * np.random.default_rng(1).standard_normal(value.shape)
+    finding, words = found_in(replace(good, value=np.round(value, digits)))
+    assert ("no arm repeats to that" in words) == said
+    assert finding is None or not finding.refused
+
+
 @pytest.mark.parametrize(("digits", "computed"), [(9, True), (4, True), (4, False)])
 def test_positions_computed_from_the_joints_are_refused(digits, computed):
     """Whatever their digits are; measured ones of as few digits are not."""
