@@ -45,12 +45,12 @@ from hilcal.store.run_log import RunLog, changed_since_begun
 from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
-FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
 TOO_LATE = (
     ("--poses", "poses"),
     ("--goal", "goal_m"),
     ("--max-time", "max_time_s"),
     ("--validation", "validation"),
+    ("--prior", "prior"),
 )
 """Options without effect: the first once a campaign exists, all once its validation is planned."""
 DEFAULT_MAX_TIME = "2 h"  # Longest time for measuring; a choice
@@ -123,15 +123,6 @@ def calibrate(
     flags += [word for path in effects_from or () for word in ("--effects-from", str(path))]
     start, go_on = (shlex.join([*line, *more, *flags]) for more in ([], ["--resume"]))
     p = _procedure(t, cell, output, resume, rehearse, robot_cell, catalogue, settings, go_on)
-    prior = p.settings.prior
-    if prior is not None:
-        if options.prior is None and Path(prior).parent != output.absolute().parent:
-            raise InputError(
-                f"{output}: its prior is {prior!r}; a file that a campaign names is read from the "
-                f"campaign's folder only; confirm it with: --prior {quoted(prior)}"
-            )
-        if p.next().kind in FITTED_LATER:
-            p = replace(p, prior=PriorOptions(Path(prior)).load(catalogue))
     if not (yes or rehearse or person_present(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
@@ -219,7 +210,7 @@ def _procedure(
         settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
         p = Procedure(output, cell, catalogue, settings)
         p.check_files()
-        return p
+        return _with_prior(p, stated)
     p = continued(output, cell, catalogue)
     if (p.settings.hide is not None) != rehearse:
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
@@ -236,7 +227,7 @@ def _procedure(
                 f"{option} comes too late: the measurements that it decides are planned already; "
                 "leave it out, or calibrate into another file"
             )
-    p = replace(p, settings=replace(p.settings, **stated))
+    p = _with_prior(replace(p, settings=replace(p.settings, **stated)), stated)
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
@@ -244,6 +235,19 @@ def _procedure(
             t.notice(f"note: {text}")
     t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
+
+
+def _with_prior(p: Procedure, stated: dict[str, Any]) -> Procedure:
+    """Load the prior, if the campaign may still be fitted."""
+    prior = p.settings.prior
+    if prior is None or p.files.validation.exists():
+        return p
+    if "prior" not in stated and Path(prior).parent != p.run.absolute().parent:
+        raise InputError(
+            f"{p.run}: its prior is {prior!r}; a file that a campaign names is read from the "
+            f"campaign's folder only; confirm it with: --prior {quoted(prior)}"
+        )
+    return replace(p, prior=PriorOptions(Path(prior)).load(p.catalogue))
 
 
 def _refuse_goal(kind: Mode, stated: dict[str, Any], cell: Path) -> None:

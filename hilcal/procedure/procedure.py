@@ -222,7 +222,8 @@ class Procedure:
     def keep(self, o: Campaign, refinement: Refinement) -> tuple[int, ...]:
         """Store the revisions of a refinement; return their numbers."""
         records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in refinement.steps]
-        content = {"readings_sha256": o.data_hash, "verdict": refinement.verdict}
+        fitted = {"readings_sha256": o.data_hash, "prior": self.settings.prior}
+        content = {**fitted, "verdict": refinement.verdict}
         self._refinements[:] = [refinement]
         return ProcedureLog(o.file).append(state.REFINED, content, revisions=records)
 

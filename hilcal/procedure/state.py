@@ -110,15 +110,14 @@ def next_step(run: Path) -> ProcedureStep:
         decided = log.last(DECIDED)
         kinds = [entry["kind"] for entry in log.entries() if entry["kind"] in (BEGUN, DECIDED)]
         changed = kinds[-1] == BEGUN  # the settings, after the last decision
-        stopped = decided is not None and decided["action"] == STOP
-        if stopped and changed and not files.validation.exists():
-            return ProcedureStep("decide", run)
-        if decided is None or decided["action"] == MEASURE:
+        again = changed and not files.validation.exists()
+        if decided is None or decided["action"] == MEASURE or again:
             missing = _missing("measure", campaign)
             if missing is not None:
                 return missing
-            refined = log.last(REFINED)
-            if refined is None or refined["readings_sha256"] != campaign.data_hash():
+            fitted = log.last(REFINED) or {}
+            now = (campaign.data_hash(), settings_of(campaign).prior)
+            if (fitted.get("readings_sha256"), fitted.get("prior")) != now:
                 return ProcedureStep("refine", run)
             return ProcedureStep("decide", run)
         validated, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None

@@ -66,7 +66,8 @@ def test_the_plain_command_says_what_is_there(there, capsys):
     assert "holds a calibration already, it is complete; go on with: hilcal calibrate" in line
     assert line.endswith("--resume --yes")
     again = ("calibrate", path.with_name("cell.toml"), "-o", path, "--yes", "--resume")
-    for late in (("--poses", "9"), ("--validation", "9"), ("--max-time", "9 h")):
+    too_late = {"--poses": "9", "--validation": "9", "--max-time": "9 h", "--prior": path}
+    for late in too_late.items():
         assert f"{late[0]} comes too late" in refused(capsys, 2, *again, *late)
     ok(capsys, *again, "--poses", "4", "--validation", "4")  # as it was begun
     told = run(capsys, *again, "--skip", "v1")

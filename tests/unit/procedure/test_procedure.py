@@ -373,3 +373,10 @@ def test_what_an_earlier_calibration_taught_is_the_prior(done, tmp_path):
         with hc.Campaign.open(d.procedure.run) as o:
             assert (o.fit().model.prior is None) == (prior is None)
     assert errors[1] < errors[0]
+    settings = replace(d.procedure.settings, prior=str(first.run))
+    p = replace(d.procedure, settings=settings, prior=known)
+    with CampaignFile.open(p.run) as run:
+        p.resume(run)
+    assert p.next().kind == "refine"  # given anew after a fit
+    p.refine()
+    assert p.next().kind == "decide"
