@@ -321,9 +321,7 @@ def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
     Those without information are zero. Without any information the axes are the parameters.
     """
     scaled = p.information * (p.scale[:, None] * p.scale)
-    rows = np.array(place, dtype=np.int64)
-    marginal = scaled if len(place) == len(scaled) else information_on(scaled, rows)
-    values, vectors = spectrum(marginal)
+    values, vectors = spectrum(information_on(scaled, np.array(place, dtype=np.int64)))
     return values, vectors if values.any() else np.eye(len(values))
 
 

@@ -43,11 +43,13 @@ from hilcal.identification.carried.carried_prior import (
     DriftGroup,
     coordinates_of,
     names_of,
+    scales_of,
 )
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import ratio_tail
+from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 
@@ -120,7 +122,14 @@ def _columns(
     a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
     theta = np.where(s.estimated | carried, s.theta, 0.0)
     theta[index[free]] = 0.0  # flat ones may stay where they are
-    return a, a[:, index[free]], a[:, index[~free]] * std[~free], s.white + a @ theta
+    flat = a[:, index[free]] * scales_of(model)[index[free]]
+    return a, flat, a[:, index[~free]] * std[~free], s.white + a @ theta
+
+
+def _determined(flat: Floats) -> Floats:
+    """Reduce columns (R, F), by ordinary magnitudes, to the directions that a fit estimates."""
+    u, values, _ = np.linalg.svd(flat, full_matrices=False)
+    return np.asarray(u[:, values > INFORMATION])
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
@@ -197,7 +206,8 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     a = of_all[:, index]
     group, unit = prior.group[place], prior.unit[place]
     drift = [a @ space.matrix[:, held]]
-    flat, random = np.hstack([without, a @ space.matrix[:, ~held]]), np.hstack([*drift, others])
+    flat = _determined(np.hstack([without, a @ space.matrix[:, ~held]]))
+    random = np.hstack([*drift, others])
     drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
     y = y - a @ space.mean
     if len(y) <= a.shape[1] + without.shape[1] + others.shape[1]:

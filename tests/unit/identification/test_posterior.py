@@ -29,7 +29,7 @@ from hilcal.store.codec import write_document
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from studies.change import measured as measured_again
-from studies.change import studied_arm
+from studies.change import remeasured, studied_arm
 from tests.support.campaigns import campaign, configuration, measured, noiseless, plan, with_noise
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
@@ -214,6 +214,31 @@ def test_a_prior_and_new_readings_are_as_all_readings_together():
         return np.asarray(covariance / std / std[:, None])
 
     np.testing.assert_allclose(correlation(found), correlation(together), atol=0.1)
+
+
+def test_the_order_of_the_effects_of_a_prior_does_not_matter():
+    c, prior = both(), carried_prior(learnt())
+    r = c.readings[c.readings.pose >= 25]
+    models = [with_effects(c.cell, r, "absolute", n, prior=prior) for n in (NAMES, NAMES[::-1])]
+    one, other = (fit(model, r, "absolute") for model in models)
+    assert one.model.names != other.model.names
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-3)
+    of = [{p.name: p.value for p in found.parameters} for found in (one, other)]
+    assert of[1] == pytest.approx(of[0], abs=1e-9)
+
+
+@pytest.mark.long
+def test_few_readings_tell_which_link_of_a_prior_has_moved():
+    """Columns of the prior's gauge directions, tiny and without a prior, hid a slipped joint."""
+    arm = studied_arm(configuration(), "ur10e", 0, poses=30)
+    physics, prior = arm.world.physics, carried_prior(Posterior.of(arm.earlier.fit))
+    zeros = physics.encoder_offset + 1.2e-3 * np.eye(6)[2]
+    slipped = replace(arm.world, physics=physics.with_effect("encoder_offset", zeros))
+    r = remeasured(slipped, arm.loads, 15, np.random.default_rng(2))
+    found = fit(baseline(arm.cell, r, "absolute", prior=prior), r, "absolute")
+    assert found.conflicts[0].group.part == "link3"
+    assert found.conflicts[0].moved_sigma > 10
+    assert found.variance_factor < 3
 
 
 def test_a_prior_that_knows_nothing_changes_nothing():
