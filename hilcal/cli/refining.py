@@ -59,7 +59,7 @@ from hilcal.present.story import Chapter, chapters_of, errors_by_revision, prior
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
-from hilcal.store.procedure_log import refuse_fitting
+from hilcal.store.procedure_log import is_test, refuse_fitting
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import different_serial_numbers
@@ -407,13 +407,15 @@ def compare(
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=same_setup or None, say=say
         )
+        fittable = not is_test(later_run.file)
     name = model_name(fitting.effect_titles(comparison.fit.model, comparison.fit.readings))
     t.show(heading(f"{run.name}: {fitting.revision_name(comparison.number)} ({name})"))
     t.show(comparison_report(comparison, run.name, later.name))
-    command = next_command(comparison, str(run), str(later))
+    files = _effect_files(catalogue, comparison.fit.model.names)
+    command = next_command(comparison, str(run), str(later), files) if fittable else None
     if command is not None:
         t.command(command)
-    t.document(comparison_json(comparison, str(run), str(later)))
+    t.document(comparison_json(comparison, str(run), command))
 
 
 def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:

@@ -266,19 +266,29 @@ def next_step(c: Comparison, earlier: str) -> str:
     return f"{check}recalibrate {parts or links}, with {earlier} as prior; {more}."
 
 
-def next_command(c: Comparison, earlier: str, later: str) -> str | None:
-    """Return the command line for the next step; None without one."""
+def next_command(
+    c: Comparison, earlier: str, later: str, effect_files: Sequence[str] = ()
+) -> str | None:
+    """Return the command line for the next step; None without one.
+
+    `effect_files`: the options that give a command the files of the effects. Readings that were
+    fitted already cannot be fitted with that fit as prior.
+    """
+    options = " ".join(["--readings", c.mode, *effect_files])
+    refit = f"hilcal refine {quoted(later)}"
     if c.another_arm:
-        return f"hilcal refine {quoted(later)}"
+        return f"{refit} {options}"
     possible = (o for x in c.changes.found for o in x.possible)
-    changed = any(o.of_arm for o in possible) or not c.changes.explained
-    return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
+    if c.shared or not (any(o.of_arm for o in possible) or not c.changes.explained):
+        return None
+    first = f"hilcal refine {quoted(earlier)} {options} && " * (c.number is None)
+    return f"{first}{refit} --prior {quoted(earlier)} {options}"
 
 
-def comparison_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
-    """Return the comparison as JSON, SI, with its sentences."""
+def comparison_json(c: Comparison, earlier: str, command: str | None) -> dict[str, object]:
+    """Return the comparison as JSON, SI, with its sentences and the next command."""
     changes = [{**x.to_dict(), "words": sentence(x)} for x in c.changes.found]
-    step = {"next": next_step(c, earlier), "next_command": next_command(c, earlier, later)}
+    step = {"next": next_step(c, earlier), "next_command": command}
     return {**c.to_dict(), "changes": changes, **step}
 
 

@@ -80,21 +80,21 @@ def purpose_of(campaign: CampaignFile) -> str | None:
     return campaign.about(PURPOSE)
 
 
-def _is_test(campaign: CampaignFile) -> bool:
+def is_test(campaign: CampaignFile) -> bool:
     """Whether a campaign was measured to test a model, and has not been released for fitting."""
     return purpose_of(campaign) is not None and RELEASED not in campaign.texts()
 
 
 def release(campaign: CampaignFile, reason: str) -> None:
     """Release a test campaign for fitting; its file records it."""
-    if _is_test(campaign):
+    if is_test(campaign):
         with campaign.transaction() as connection:
             rows.insert_meta(connection, RELEASED, json.dumps({"utc": utc_now(), "by": reason}))
 
 
 def refuse_fitting(campaign: CampaignFile) -> None:
     """Refuse a test campaign that has not been released for fitting."""
-    if not _is_test(campaign):
+    if not is_test(campaign):
         return
     validates = purpose_of(campaign) == VALIDATION
     kind = "a validation campaign" if validates else "the run at corrected targets"

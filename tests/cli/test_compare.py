@@ -14,9 +14,13 @@ import hilcal as hc
 from hilcal.config import CellConfig, Repeatability, load_config
 from hilcal.drivers.simulated.world import World, place_tracker
 from hilcal.identification.noise.full_covariance import joint_factors
+from hilcal.present.comparison import next_command
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.procedure_log import PURPOSE, VALIDATION
+from hilcal.store.rows import insert_meta
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.campaigns import campaign as simulated
@@ -65,6 +69,22 @@ def site(tmp_path_factory):
 
 
 @pytest.mark.long
+def test_the_next_command_is_one_that_can_be_given(site, capsys):
+    """A prior needs a fit, and other readings; a test campaign is not fitted."""
+    repaired = site.store("next.hilcal", site.measured(3, (0, 0, 1.2e-3, 0, 0, 0)))
+    c = hc.compare(site.earlier, repaired)
+    options = "--readings absolute --effects-from law.py"
+    assert next_command(replace(c, number=None), "a b", "c", options.split()[2:]) == (
+        f"hilcal refine 'a b' {options} && hilcal refine c --prior 'a b' {options}"
+    )
+    assert next_command(replace(c, shared=3), "a", "b") is None
+    with CampaignFile.open(repaired) as campaign, campaign.transaction() as connection:
+        insert_meta(connection, PURPOSE, VALIDATION)
+    d = ok(capsys, "compare", site.earlier, repaired, "--json").document
+    assert (d["changed"], d["next_command"]) == (True, None)
+
+
+@pytest.mark.long
 def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys):
     same = site.store("same.hilcal", site.measured(1))
     repaired = site.store("repaired.hilcal", site.measured(2, (0, 0, 1.2e-3, 0, 0, 0)))
@@ -88,7 +108,10 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys)
     assert "Joint 3's zero has moved by +1." in words
     assert "as if it had been moved" in words
     assert "Next: recalibrate joint 3" in words
-    assert words.rstrip().endswith(f"hilcal refine {repaired} --prior {site.earlier}")
+    command = f"hilcal refine {repaired} --prior {site.earlier} --readings absolute"
+    assert words.rstrip().endswith(command)
+    d = ok(capsys, *command.split()[1:], "--json").document
+    assert d["prior"]["effects"][0]["moved_sigma"] > 5
     for other, asks in ((same, False), (repaired, True)):
         told = ok(capsys, "validate", site.earlier, other, "--register").out
         assert ("hilcal compare says what has changed" in told) is asks
