@@ -234,8 +234,8 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """
     against, cell = config.planning.against, model.cell
     if against == "catalogue":
-        kinds = (k for k in model.catalogue.effects if k.applies(cell) and k.role != "observer")
-        names = tuple(kind.name for kind in kinds if not kind.needs)
+        kinds = (k for k in model.catalogue.effects if k.applies(cell))
+        names = tuple(k.name for k in kinds if not k.needs and k.role not in FRAME_ROLES)
     else:
         names = valid_effects(against, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
@@ -244,10 +244,10 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
 def expected_std(model: Model, effects: tuple[Effect, ...]) -> Floats:
     """Return the standard deviations (F,), SI, of the parameters of effects outside of a model.
 
-    They are those of the mixed model's families.
+    They are those of the mixed model's families; of a frame, which has none, the ordinary ones.
     """
     alone = replace(model, effects=effects, random={}, background=frozenset(), prior=None)
-    std = np.zeros(alone.size)
+    std = scales_of(alone)
     for f in families_of(alone).random:
         std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
     return std

@@ -53,7 +53,7 @@ _OPTION = re.compile(
     r"\b(Offset|Tool_Offset|VOFFSET|INC|Skip|COORD|ATool_?Offset|BOffset|TPT|RTCP)\b", re.IGNORECASE
 )
 _REFUSED = re.compile(
-    r"\b(UFRAME|UTOOL)\s*\[[^;=]*\]\s*=(?!=)|\$MNUFRAME\w*\s*\[|\$MNUTOOL\w*\s*\["
+    r"\b(UFRAME|UTOOL)\s*\[[^;=]*\]\s*=(?!=)|\$[^;=]*(FRAME|TOOL)[^;=]*=(?!=)"
     r"|\bTouch\s+Offset\s+PR\b"
 )
 _NUMBERED = re.compile(r"^[ \t]*(\d+)[ \t]*:", re.MULTILINE)

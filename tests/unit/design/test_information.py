@@ -17,6 +17,7 @@ from hilcal.design.information import MOST_PARAMETERS, MOST_TIMES, problem, read
 from hilcal.design.nominal_model import model_after, nominal_model, nominal_states
 from hilcal.design.predicted import predicted_uncertainty, prediction_poses
 from hilcal.effects.catalogue import installed
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried.carried_prior import carried_prior
@@ -316,12 +317,18 @@ def test_the_catalogue_is_planned_for_or_said_not_to_be(mode):
     for kind in installed().effects:
         name = kind.name
         planned = name in {t.effect for t in p.terms}
-        if not kind.applies(CELL) or kind.role == "observer":
-            assert not planned  # the arm has no slide, the cell one tracker; a remainder is unknown
+        said = any(note.startswith(f"{name}: not planned for") for note in p.notes)
+        if not kind.applies(CELL) or kind.role in FRAME_ROLES:
+            assert not planned  # the arm has no slide; the cell states its frames
+            assert not said
         elif not kind.needs:
-            assert planned != any(note.startswith(f"{name}: not planned for") for note in p.notes)
+            assert planned != said
         else:
             assert not planned  # only the order of a plan tells them
+
+
+def test_a_stated_place_of_the_target_is_planned_against_where_asked_for():
+    assert {e.name for e in made("absolute", ("target_offset",)).families} == {"target_offset"}
 
 
 def test_deflections_do_not_plan_for_what_cancels_in_them():
