@@ -570,6 +570,7 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
     note = (
         f"{path}: the four lines delta_… changed, all else as it was. The rows do not contain "
         f"the pose of joint 1's axis in the base (up to {length(new.base_moves)}) and that of the "
-        f"flange on the last axis (up to {length(new.flange_moves)})"
+        f"flange on the last axis (up to {length(new.flange_moves)}): the tool centre point on an "
+        "arm with these rows is tcp_for_ur_kinematics of --frames with --ur-kinematics"
     )
     return CorrectedFile(edited(text, edits).encode("latin-1"), note)

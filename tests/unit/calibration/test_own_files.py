@@ -200,7 +200,9 @@ def test_ur_s_calibration_conf_makes_the_controller_s_rows_the_arm(tmp_path):
     )
     path = tmp_path / "calibration.conf"
     path.write_bytes(text.encode())
-    after = correct(path, nominal, new).content.decode()
+    found = correct(path, nominal, new)
+    assert "tcp_for_ur_kinematics" in found.note
+    after = found.content.decode()
     assert len(lines_changed(text, after)) == 4
     deltas = {
         key: np.array([float(v) for v in values.split(",")])
