@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
@@ -196,6 +197,7 @@ def plan_readings(
     if count < 1:
         raise InputError(f"{count} {unit}; valid: a whole number from 1")
     budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
+    limits.check_planned(f"{count} {unit}", "readings", int(budget))
     objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
