@@ -221,7 +221,8 @@ class Measurer:
         rest_start: float | None = None
         window = SettleWindow(acquire.samples)
         while True:
-            if not self._mover.at_rest(self._mover.checked_sample()):
+            unrest = self._mover.unrest(self._mover.checked_sample())
+            if unrest is not None:
                 rest_start, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
@@ -232,12 +233,13 @@ class Measurer:
                     return clock.now() - start
             late = clock.now() - start > acquire.settle_timeout_s
             if late and (rest_start is None or count >= MAX_WINDOWS * acquire.samples):
-                reason = "the readings drift"
-                if rest_start is None:
-                    reason = "the arm does not rest at its goal"
+                reason = (
+                    "readings drift. Look for a swinging load, a loose target, a warming tracker"
+                )
+                if unrest is not None:
+                    reason = f"arm: {unrest}. Was it moved by hand, or does something push it?"
                 raise DeviceError(
-                    f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}. Look "
-                    "for a swinging load, a loose target or a warming tracker"
+                    f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}"
                 )
 
     def _averaged(

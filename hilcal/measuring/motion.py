@@ -346,10 +346,15 @@ class Mover:
         return sample
 
     def put_back(self, ask: Callable[[str], None]) -> None:
-        """Move an arm back that was moved during a question; see `agreed_start`."""
-        if self.goal is None or self.moved_by_others(self._arm.sample()) is None:
+        """Move an arm back that was moved during a question; see `agreed_start`.
+
+        Less than `MOVED_RAD` is no question, but no place for a reading either.
+        """
+        goal, name, sample = self.goal, WHERE_LEFT, self._arm.sample()
+        if goal is None:
             return
-        goal, name = self.goal, WHERE_LEFT
+        if np.abs([sample.q - goal, sample.q_target - goal]).max() <= self._motion.arrival_rad:
+            return
         self.goal = self.agreed_start(goal, name, goal, ask)
         self.move(goal, name)
 
@@ -450,19 +455,23 @@ class Mover:
             return f"arm: its clock has stood still for {FROZEN_S:g} s; its data are old"
         return None
 
-    def at_rest(self, sample: ArmSample) -> bool:
-        """Whether the arm stands at its goal, by a sample."""
-        goal = sample.q if self.goal is None else self.goal
-        arrived = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
-        return bool(arrived and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)
+    def unrest(self, sample: ArmSample) -> str | None:
+        """Return why the arm does not stand at its goal, by a sample, in one line; or None."""
+        joint, distance = self._worst(sample.q - (sample.q if self.goal is None else self.goal))
+        if not distance <= (limit := self._motion.arrival_rad):
+            return f"{joint} stands {distance:.3g} rad off its goal (arrival_rad is {limit:g})"
+        joint, speed = self._worst(sample.qd)
+        if not speed <= self._motion.speed_rad_s / 50:
+            return f"{joint} still moves at {speed:.3g} rad/s"
+        return None
 
     def check_still(self, before: ArmSample, after: ArmSample) -> str | None:
         """Return why a reading between two samples is void, in one line; or None."""
         if self.goal is not None:
-            deviation = float(np.abs(after.q_target - self.goal).max())
+            joint, deviation = self._worst(after.q_target - self.goal)
             if deviation > self._motion.arrival_rad:
-                return f"arm: somebody else commanded it by {deviation:.3g} rad during the reading"
-        moved = float(np.abs(after.q - before.q).max())
+                return f"arm: somebody else commanded {joint} by {deviation:.3g} rad"
+        joint, moved = self._worst(after.q - before.q)
         if not moved <= STILL_RAD:
-            return f"arm: it moved by {moved:.3g} rad during the reading"
+            return f"arm: {joint} moved by {moved:.3g} rad during the reading"
         return None

@@ -547,7 +547,7 @@ def test_readings_that_drift_are_waited_for_and_given_up():
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
     b.world.creep = 1e-3
     begun = b.world.time
-    refusal_of(DeviceError, "not settled within 20 s: the readings drift", b.measure)
+    refusal_of(DeviceError, "not settled within 20 s: readings drift", b.measure)
     assert b.store.rows == []
     assert b.world.time - begun < 120.0
 
@@ -575,7 +575,7 @@ def test_drift_that_ends_is_waited_for():
 
 def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
-    refusal_of(DeviceError, r"measured 3 times without success: arm: it moved by", b.measure)
+    refusal_of(DeviceError, r"measured 3 times without success: arm: .* moved by", b.measure)
     assert b.store.rows == []
 
 
