@@ -23,6 +23,8 @@ SPREAD_M = 0.05  # least second singular value of centred positions that determi
 PLAUSIBLE_M = 0.1  # largest distance of a reading from the nominal position of its target, m
 FITS_M = 0.02
 """Largest residual of a reading that fits a registration, m; the errors of arms are smaller."""
+CLEARLY = 3.0
+"""Distance of a doubtful reading from its place, over the farthest of those that fit. A choice."""
 MOST_OMITTED = 3  # readings that a registration omits at most; else the nominal arm is wrong
 APART_M = 0.05  # largest error of a distance between two readings, m
 STUCK_M = 1e-5  # nearer readings at different poses, m, are one repeated reading
@@ -65,17 +67,22 @@ class RoughRegistration:
     def late_doubts(self) -> list[tuple[Step, str]]:
         """Return stored readings that may be of another target, each once, with the reason.
 
-        Once the registration is known, readings that do not fit it; until then, a reading that the
-        next one repeated.
+        Once the registration is known, readings that do not fit it: farther than `PLAUSIBLE_M`, or,
+        if more than `MIN_READINGS` fit, than `FITS_M` and `CLEARLY` times the farthest of these.
+        Until then, a reading that the next one repeated.
         """
         pose = self.pose()
         if pose is None:
             repeated, self._repeated = self._repeated, []
             return repeated
-        out = []
-        for x in self._sightings:
-            far = float(_residuals(pose, x.nominal[None], x.position[None])[0])
-            if far > PLAUSIBLE_M and self._cell.known_targets[x.target] and not x.doubted:
+        out, seen = [], self._sightings
+        places = np.reshape([(x.nominal, x.position) for x in seen], (-1, 2, 3))
+        distances = _residuals(pose, places[:, 0], places[:, 1])
+        fits, limit = distances[distances <= FITS_M], PLAUSIBLE_M
+        if len(fits) > MIN_READINGS:
+            limit = min(max(CLEARLY * float(fits.max()), FITS_M), PLAUSIBLE_M)
+        for x, far in zip(seen, distances.tolist(), strict=True):
+            if far > limit and self._cell.known_targets[x.target] and not x.doubted:
                 x.doubted = True
                 why = f"its target was {far:.3g} m from where the arm holds it; another reflector?"
                 out += [] if x.step is None else [(x.step, why)]
