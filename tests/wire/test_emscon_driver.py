@@ -1,9 +1,11 @@
 """The driver of Leica's laser trackers (emScon): against our simulated tracker, and CESAPI's."""
 
 import socket
+import struct
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +13,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers.emscon import open_tracker
+from hilcal.drivers.emscon import EmsconConnection, EmsconOptions, EmsconTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import PointingTracker, TargetLostError
+from hilcal.measuring.devices import Clock, PointingTracker, TargetLostError
 from tests.support.instruments import TARGET, TURNED, cell, emscon
 
 
@@ -143,6 +145,66 @@ def test_one_of_several_targets_is_aimed_at(there):
             device.aim(other + up, 0.05)
         there[0].truth(targets=np.zeros((8, 3)))
         device.find_target()
+
+
+# results that are none
+
+
+class Altered(EmsconConnection):
+    """A connection that alters each result: its status, or the measurement in it."""
+
+    def __init__(self, address, status=es.OK, **change):
+        host, port = address.split(":")
+        super().__init__(host, int(port))
+        self.status, self.change = status, change
+
+    def result(self, *, deadline):
+        kind, status, body = super().result(deadline=deadline)
+        if self.change:
+            changed = replace(es.measurement(kind, body), **self.change)
+            kind, body = es.pack_measurement(changed, es.STATIONARY, (20.0, 1013.0, 40.0))
+        return kind, self.status or status, body
+
+
+@pytest.mark.parametrize(
+    ("options", "change", "said"),
+    [
+        ({}, {"status": es.NO_RESULT}, "beam broken"),
+        ({}, {"status": 10013}, "does not stand firmly"),
+        ({}, {"quaternion": np.array([1.0, 0.0, 0.0, 0.0])}, "another mode than set"),
+        ({}, {"position": np.zeros(3)}, "a target 0 m away"),
+        ({}, {"position": np.full(3, 1e3)}, "a target 1732 m away"),
+        ({"target": "pose"}, {"quaternion": np.array([2.0, 0, 0, 0])}, "quaternion of length 2"),
+    ],
+)
+def test_a_result_that_is_none_is_no_reading(there, options, change, said):
+    with opened(there):
+        pass  # the tracker takes one client
+    config = cell(there[1], "emscon").tracker
+    options = EmsconOptions(measuring_s=0.1, **options)
+    device = EmsconTracker(lambda: Altered(there[1], **change), config, options, Clock(20.0))
+    with closing(device), pytest.raises(DeviceError, match=said):
+        device.measure()
+
+
+def test_zeros_that_another_program_has_found_again_are_named(there):
+    with opened(there) as device:
+        there[0].admin("change", number=es.INITIALIZATION_CHANGED)
+        assert "axes may have moved" in device.measure().warning
+        assert device.measure().warning == ""
+
+
+def test_the_answer_to_another_command_is_not_taken():
+    def packet(command, content):
+        body = struct.pack("<II", command, es.OK) + content
+        return es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body
+
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        line = EmsconConnection(*door.getsockname())
+        peer, _ = door.accept()
+        with closing(line), peer:
+            peer.sendall(packet(es.GET_UNITS, b"old") + packet(es.GET_MODE, b"new"))
+            assert line.ask(es.GET_MODE, deadline=time.monotonic() + 1.0) == (es.OK, b"new")
 
 
 # the connection
