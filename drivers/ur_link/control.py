@@ -18,6 +18,7 @@ from hilcal.drivers.ur_link.reading import STALE_S, Reading, Receiver
 from hilcal.drivers.ur_link.states import CHECK_LINK, RESUME, failure
 from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, UrController
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.errors import undone_by
 from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
@@ -118,7 +119,13 @@ class Control(Worker):
         """Take control of the arm within a deadline."""
         flags = controller.script_port == PRIMARY_PORT, controller.upper_registers
         arguments = repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags)
-        super().__init__("control", (controller.host, *arguments), seconds)
+        try:
+            super().__init__("control", (controller.host, *arguments), seconds)
+        except BaseException as error:  # ended between upload and watchdog, it leaves its program
+            if _IN_USE not in str(error):
+                with contextlib.suppress(LinkError):
+                    controller.supervision.stop(ASK_S)
+            raise
 
     def renew_lease(self, seconds: float = COMMAND_S) -> tuple[bool, float]:
         """Renew the lease of the motion; `seconds`: deadline of the answer, real s.
@@ -170,11 +177,11 @@ def take_control(controller: UrController, receiver: Receiver) -> Control:
         if "remote control" in text:
             text = "it is in local mode; switch it to remote control on the pendant"
         raise failure(host, f"cannot take control: {text}") from None
-    try:
-        _wait_for(receiver, (states.PLAYING,), 1.0)
-    except LinkError as error:
-        control.kill()
-        raise failure(host, f"cannot take control: {error}") from None
+    with undone_by(control.kill):
+        try:
+            _wait_for(receiver, (states.PLAYING,), 1.0)
+        except LinkError as error:
+            raise failure(host, f"cannot take control: {error}") from None
     return control
 
 

@@ -76,11 +76,17 @@ def test_poses_of_a_6d_target_scatter_as_the_tracker_states(there):
 def test_what_another_program_has_set_is_set_right(there):
     """Units, transformation into an object's axes: at first, and when they change meanwhile."""
     tracker = there[0]
+    with opened(there):
+        pass  # it takes one client
+    with closing(EmsconConnection(*there[1].split(":"))) as other:
+        polar = struct.pack("<I", 3)
+        assert other.ask(es.SET_COORDINATES, polar, deadline=time.monotonic() + 2.0)[0] == es.OK
     with opened(there) as device:
         tracker.admin("transform", on=True)
         assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
         settings = tracker.admin("state")["settings"]
         assert settings[str(es.GET_UNITS)] == "00" * 20  # m, rad; it begins with mm and degrees
+        assert settings[str(es.GET_COORDINATES)] == "00" * 4
 
 
 # the target

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import closing, contextmanager
 
@@ -13,6 +14,7 @@ import psutil
 import pytest
 
 from hilcal.drivers.simulated.cell_processes import free_host
+from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import supervision
 from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError
@@ -332,6 +334,26 @@ def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
             sim.wait("rtde_clients", 0)
             cases.controlled(sim).close()  # and the next program takes over
     finally:
+        cases.supervision(sim).stop(2.0)
+
+
+def test_ctrl_c_while_control_is_taken_leaves_no_program_behind(sim):
+    scripts = sim.admin()["scripts"]
+
+    def interrupt():
+        while sim.admin()["scripts"] == scripts:
+            time.sleep(0.001)
+        os.kill(os.getpid(), signal.SIGINT)  # the program is uploaded and has no watchdog yet
+
+    person = threading.Thread(target=interrupt)
+    try:
+        with closing(open_arm(cases.config(sim.host))) as arm:
+            person.start()
+            with pytest.raises(KeyboardInterrupt):
+                arm.take_control(cases.MASS, cases.COM)
+        sim.wait("script_running", False)
+    finally:
+        person.join()
         cases.supervision(sim).stop(2.0)
 
 
