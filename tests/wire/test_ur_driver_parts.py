@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,13 @@ from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
-from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
+from hilcal.drivers.ur_link.control import (
+    MARGIN_S,
+    Brakes,
+    MotionInProgress,
+    deceleration,
+    program_ended,
+)
 from hilcal.drivers.ur_link.probe import LinkError, controller
 from hilcal.drivers.ur_link.reading import (
     OUTPUTS,
@@ -106,6 +113,29 @@ def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
     assert motion.arrived(there)
     assert not motion.arrived(reading(actual_qd=[0.0] * 6, actual_q=goal + 6e-4, target_q=goal))
     assert not motion.arrived(reading(actual_qd=[0.02] * 6, actual_q=goal, target_q=goal))
+    assert not motion.arrived(reading(actual_qd=[0.0] * 6, actual_q=goal, target_q=goal + 1e-4))
+
+
+def test_a_motion_scaled_to_nothing_is_overdue_after_the_margin_and_not_before(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    motion = MotionInProgress(np.zeros(N), np.full(N, 1.0), 0.5, 0.5, 5e-4, clock=1.0)
+    paused, slow = (reading(speed_scaling=x, target_speed_fraction=1.0) for x in (0.0, 0.1))
+    assert motion.overdue(paused) is None
+    for said, share in ((None, paused), (None, slow), (None, paused), ("scaled to 0", paused)):
+        now[0] += MARGIN_S + 0.01 * (said is not None) - 0.005
+        why = motion.overdue(share)
+        assert why is None if said is None else said in why
+
+
+def test_an_arm_stands_when_two_readings_in_a_row_say_so():
+    """One alone may be of an arm that has not yet begun to move, or turns back."""
+    still, moving = (reading(actual_qd=[x] * 6, runtime_state=states.PLAYING) for x in (0.0, 0.2))
+    readings = [still, moving, still, still, moving]
+    receiver = SimpleNamespace(read=lambda stale: readings.pop(0))
+    control = SimpleNamespace(stop=lambda brake, seconds: None, end_lease=lambda: None)
+    assert Brakes(None, receiver).stop_in_control(control, 2.0)
+    assert readings == [moving]
 
 
 def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
