@@ -16,7 +16,7 @@ import pytest
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import supervision
-from hilcal.drivers.ur_link.worker import environment
+from hilcal.drivers.ur_link.worker import Worker, environment
 from hilcal.errors import DeviceError
 from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
@@ -245,6 +245,20 @@ def test_stop_without_control_process_and_dashboard(arm, sim):
     os.kill(arm.workers[1], signal.SIGKILL)
     arm.stop()
     cases.check_resting(sim, since)
+
+
+def test_the_answer_to_a_request_that_was_interrupted_is_not_that_to_the_next(sim):
+    worker = Worker("receive", (sim.host, "125.0", "timestamp"), 10.0)
+    usual = signal.signal(signal.SIGALRM, signal.default_int_handler)  # as Ctrl-C
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            worker.call("rate", 2.0, window=0.3, stale=0.8)
+        assert "fields" in worker.call("sample", 2.0, stale=0.8)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, usual)
+        worker.kill()
 
 
 def test_close_in_motion_stops_and_leaves_no_process(sim):
