@@ -340,8 +340,10 @@ class NatNetTracker:
         if number == self._newest:
             return None
         self._newest = number
-        if not all(np.isfinite([*b.position, *b.quaternion]).all() for b in bodies):
-            return None
+        for body in bodies:
+            turn = float(np.linalg.norm(body.quaternion))
+            if body.tracked and not (np.isfinite(body.position).all() and abs(turn - 1.0) < 0.01):
+                return None
         return bodies
 
     def _greet(self) -> NatNetServer:

@@ -307,7 +307,7 @@ def _natnet() -> Parser:
         if data[0] < 4:
             bodies = tracker._next(Socket(data[1:]))  # type: ignore[arg-type]
             for body in bodies or ():
-                if not np.isfinite([*body.position, *body.quaternion]).all():
+                if body.tracked and not np.isfinite([*body.position, *body.quaternion]).all():
                     raise Accepted("natnet: a pose that cannot be")
             return any(b.number == BODY for b in bodies or ())
         tracker._options = type("Options", (), {"rigid_body": "tool"})()  # type: ignore[assignment]

@@ -2,12 +2,13 @@
 
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.natnet import open_tracker
+from hilcal.drivers.natnet import Body, frame, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import TargetLostError
 from tests.support.instruments import TARGET, TURNED, cell, natnet
@@ -119,6 +120,32 @@ def test_a_body_that_is_hidden_is_a_lost_target(there):
         assert any("not seen" in problem for problem in device.report().problems)
         there[0].admin("beam", on=False)
         device.find_target()
+        right(device.measure())
+
+
+def test_frames_from_before_a_measurement_are_not_in_it(there):
+    """They wait in the socket since the last one, of the pose before."""
+    away = np.array(TARGET) + 0.1
+    with opened(there[1]) as device:
+        right(device.measure())
+        time.sleep(0.2)
+        there[0].truth(target=away)
+        time.sleep(0.1)
+        assert device.measure().value[:3] == pytest.approx(away, abs=2 * OFF)
+    there[0].truth(target=np.array(TARGET))
+
+
+def test_a_pose_that_cannot_be_costs_its_frame_and_one_that_is_not_seen_none(there, monkeypatch):
+    none = Body(99, np.full(3, np.nan), np.zeros(4), tracked=False)
+
+    def altered(content, version):
+        number, bodies = frame(content, version)
+        wrong = {0: np.zeros(4), 1: np.full(4, np.nan)}.get(number % 4)
+        bodies = [b if wrong is None else replace(b, quaternion=wrong) for b in bodies]
+        return number, [*bodies, none]
+
+    monkeypatch.setattr("hilcal.drivers.natnet.frame", altered)
+    with opened(there[1]) as device:
         right(device.measure())
 
 
