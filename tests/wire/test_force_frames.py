@@ -1,6 +1,8 @@
 """Frames of force sensors out of damaged streams, and the count of what was lost."""
 
+import math
 import struct
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
-from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer
+from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer, ForceStream
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,
@@ -198,3 +200,34 @@ def test_by_arrival_frames_that_were_held_up_are_not_lost():
     counter = ByArrival(100.0)
     arrivals(counter, np.maximum.accumulate(trickle))
     assert counter.lost == 0
+
+
+class Held:
+    """A port that holds some bytes."""
+
+    port, baudrate = "nowhere", 460800
+
+    def __init__(self, data):
+        self.in_waiting, self._data = len(data), data
+
+    def read(self, size):
+        self.in_waiting = 0
+        return self._data
+
+    def close(self):
+        pass
+
+
+def test_frames_of_another_time_or_without_possible_values_are_not_stored():
+    def sent(ms, force):
+        body = struct.pack("<H6fIf", 0, force, 0, 0, 0, 0, 0, 1000 * ms, 25.0)
+        return b"\xaa" + body + bota.SENSOR.frame.checksum(b"\xaa" + body)
+
+    frames = [sent(k, 10.0) for k in range(100, 160)]
+    strays = {20: sent(50, 500.0), 30: sent(99_000, 500.0), 40: sent(139, math.nan)}
+    for k, frame in strays.items():
+        frames[k] = frame
+    with closing(ForceStream(Held(b"".join(frames)), bota.SENSOR)) as stream:
+        count = stream.started().losses()
+        assert (count.frames, count.corrupt) == (57, 3)
+        assert stream.latest().wrench[0] == 10.0
