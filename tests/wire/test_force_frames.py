@@ -2,6 +2,8 @@
 
 import math
 import struct
+import threading
+import time
 from contextlib import closing
 
 import numpy as np
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer, ForceStream
+from hilcal.errors import DeviceError
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,
@@ -208,7 +211,10 @@ class Held:
     port, baudrate = "nowhere", 460800
 
     def __init__(self, data):
-        self.in_waiting, self._data = len(data), data
+        self.hold(data)
+
+    def hold(self, data):
+        self._data, self.in_waiting = data, len(data)
 
     def read(self, size):
         self.in_waiting = 0
@@ -231,3 +237,37 @@ def test_frames_of_another_time_or_without_possible_values_are_not_stored():
         count = stream.started().losses()
         assert (count.frames, count.corrupt) == (57, 3)
         assert stream.latest().wrench[0] == 10.0
+
+
+def test_a_mean_of_too_few_frames_is_none():
+    """Of a sensor of 1 kHz that has become slow: what is missing was perhaps not alike."""
+
+    def sent(first, count):
+        bodies = (
+            struct.pack("<H6fIf", 0, *[0.1 * k] * 6, 1000 * k, 25.0)
+            for k in range(first, first + count)
+        )
+        return b"".join(b"\xaa" + b + bota.SENSOR.frame.checksum(b"\xaa" + b) for b in bodies)
+
+    port = Held(sent(0, 60))
+
+    def trickle():
+        for k in range(10):
+            time.sleep(0.1)
+            port.hold(sent(60 + 5 * k, 5))
+
+    with closing(ForceStream(port, bota.SENSOR)) as stream:
+        stream.started()
+        feeder = threading.Thread(target=trickle)
+        feeder.start()
+        with pytest.raises(DeviceError, match=r"of 100 frames in 0\.1 s"):
+            stream.average(0.1)
+        feeder.join()
+
+
+def test_a_hex_at_the_end_of_its_counts_is_over_its_range():
+    sensor = onrobot_hex._sensor(50.0, 2000.0, 1000.0)
+    full = 32767 * sensor.unit
+    assert not sensor.overload(0.9 * full, 0)
+    for k in range(6):
+        assert "over its range" in sensor.overload(-full * np.eye(6)[k], 0)
