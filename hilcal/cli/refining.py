@@ -411,7 +411,7 @@ def compare(
     name = model_name(fitting.effect_titles(comparison.fit.model, comparison.fit.readings))
     t.show(heading(f"{run.name}: {fitting.revision_name(comparison.number)} ({name})"))
     t.show(comparison_report(comparison, run.name, later.name))
-    files = _effect_files(catalogue, comparison.fit.model.names)
+    files = words.effect_files(catalogue, comparison.fit.model.names)
     command = next_command(comparison, str(run), str(later), files) if fittable else None
     if command is not None:
         t.command(command)

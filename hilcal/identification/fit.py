@@ -218,31 +218,31 @@ class Fit(WithVarianceFactor, Tabular):
         """Number of directions of the parameters that the data determine."""
         return int(self.solution.equations.basis.transform.shape[1])
 
-    @cached_property
+    @property
     def is_saturated(self) -> bool:
         """Whether the fit has used more than half of the degrees of freedom of readings or poses.
 
-        Its residual is then small whatever the arm is, and proves nothing. Further loads at the
-        same poses tell nothing of what does not depend on the load.
+        Its residual is then small whatever the arm is, and proves nothing.
         """
-        return self.dof < self.whitening.rank / 2 or self._used_by_poses > 0.5
+        return max(1.0 - self.dof / self.whitening.rank, self.used_by_poses) > 0.5
 
-    @property
-    def _used_by_poses(self) -> float:
-        """Share that the fit has used of the m degrees of freedom of the mean of each pose.
+    @cached_property
+    def used_by_poses(self) -> float:
+        """Share that the fit has used of the degrees of freedom of the poses.
 
-        With H the hat matrix and M the projection to means over the readings of a pose, tr M H
-        over m times the number of poses; 0 where each pose was read once.
+        Further loads at a pose tell nothing of what does not depend on the load. With H the hat
+        matrix of n poses with m elements, and M the projection to the mean of each pose's readings,
+        it is tr M H/(n m); 0 where every pose was read once.
         """
         pose = np.unique(self.pose, return_inverse=True)[1].reshape(-1)
         size = np.bincount(pose)
         if size.max(initial=1) == 1:
             return 0.0
-        s, m = self.solution, self.whitening.m
+        s = self.solution
         moved = (s.rows @ s.equations.inverse_root(s.beta).T).reshape(len(pose), -1)
         total = np.zeros((len(size), moved.shape[1]))
         np.add.at(total, pose, moved)
-        return float(np.sum(total**2 / size[:, None])) / (m * len(size))
+        return float(np.sum(total**2 / size[:, None])) / (self.whitening.m * len(size))
 
     @property
     def mahalanobis2(self) -> Floats:

@@ -253,11 +253,14 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
 
 
 def _few_readings(d: Diagnosis) -> list[str]:
-    total = d.fit.whitening.rank
+    fit, total = d.fit, d.fit.whitening.rank
+    used = f"{total - fit.dof:.0f} of {total} degrees of freedom"
+    if fit.used_by_poses > 1.0 - fit.dof / total:
+        used = f"{percent(fit.used_by_poses)} of the degrees of freedom of the poses"
     return [
-        f"Residuals are what the noise explains: variance factor {d.fit.variance_factor:.2f}.",
-        f"But the fit has used {total - d.fit.dof:.0f} of {total} degrees of freedom, so that a "
-        "missing effect would hardly show. Measure more poses.",
+        f"Residuals are what the noise explains: variance factor {fit.variance_factor:.2f}.",
+        f"But the fit has used {used}, so that a missing effect would hardly show. Measure more "
+        "poses.",
     ]
 
 

@@ -25,6 +25,7 @@ from hilcal.refinement import refine
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.diagnosis_cases import fitted_baseline
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 from tests.support.rows import first
 
@@ -144,6 +145,18 @@ def test_a_fit_that_uses_most_of_the_readings_proves_nothing():
     )
     assert (few.verdict, many.verdict) == ("ambiguous", "adequate")
     assert "has used 31 of 54 degrees of freedom" in message(few)
+
+
+def test_further_loads_at_the_same_poses_prove_nothing_of_the_geometry():
+    c = campaign("link_geometry", "absolute", 1, poses=12)
+    f = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "link_geometry"))
+    element = 3 * np.repeat(f.pose, 3) + np.tile(np.arange(3), len(f.pose))
+    mean = (element[:, None] == element) / np.bincount(element)[element]
+    hat = f.solution.rows @ np.linalg.pinv(f.solution.rows)
+    assert f.used_by_poses == pytest.approx(np.trace(mean @ hat) / 36)
+    d = diagnose(f)
+    assert (f.dof > 0.8 * len(hat), d.verdict, d.reason) == (True, "ambiguous", "few_readings")
+    assert "has used 79 % of the degrees of freedom of the poses" in message(d)
 
 
 def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
