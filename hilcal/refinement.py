@@ -431,9 +431,8 @@ class Path:
         neither the noise nor an unknown effect. They stay as the model's background if the error on
         poses left out falls by a share (`background_is_better`); also by more than it scatters from
         pose to pose where, by the verdict `unknown_effect`, they may imitate an effect that the
-        catalogue lacks. Where the fit has used more than half of the readings' degrees of freedom,
-        its small residual proves nothing: they are tried, and stay unless the error on poses left
-        out rises beyond chance. See `_append_background` for their names.
+        catalogue lacks. Where the fit is saturated (`Fit.is_saturated`) its small residual proves
+        nothing: they stay. See `_append_background` for their names.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
@@ -461,10 +460,8 @@ class Path:
                 named = fit_again(named, outlier=fitted.outlier)
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
-        better = background_is_better(named, fitted)
-        if last.fit.is_saturated:
-            better = not predicts_better(fitted, named)
-        if not better:
+        # effects of a saturated fit were chosen by an error on poses left out that is too small
+        if not last.fit.is_saturated and not background_is_better(named, fitted):
             return False
         if d.verdict == "unknown_effect":
             share = explained_share(named, fitted)
