@@ -445,10 +445,13 @@ class Path:
         self._background_tried = True
         if not allows_background(last.fit):
             return False
+        saturated = last.fit.is_saturated
+        if saturated:  # also with the effects shrunk, as they are in the end
+            saturated = (with_shrunk_effects(last.fit, self._start) or last.fit).is_saturated
         if d.residual_is_noise and last.fit.readings.arm_scatter is None:
             # The residual of serially correlated noise resembles effects.
             serial = last.fit.readings.serial is not None
-            if serial or (not last.fit.is_saturated and p_value_of_others(last.fit) > JOINT_LEVEL):
+            if serial or (not saturated and p_value_of_others(last.fit) > JOINT_LEVEL):
                 return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
@@ -461,7 +464,7 @@ class Path:
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
         # effects of a saturated fit were chosen by an error on poses left out that is too small
-        if not last.fit.is_saturated and not background_is_better(named, fitted):
+        if not saturated and not background_is_better(named, fitted):
             return False
         if d.verdict == "unknown_effect":
             share = explained_share(named, fitted)

@@ -48,7 +48,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError, expect
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import derivative
-from hilcal.identification.prediction.other_temperatures import by_other_temperatures
+from hilcal.identification.prediction.other_temperatures import OtherTemperatures
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
     RobotFrames,
@@ -105,6 +105,7 @@ class Calibration(Brief):
     """Means that replace columns of `States` that points lack, by column."""
     turn_std: float = 0.0
     """rad, about each axis: how far the flange may be turned beside the target, see `_turn_std`."""
+    other_temperatures: OtherTemperatures | None = None  # None of deflections, and of old files
 
     @cached_property
     def _tracked(self) -> ToolPose:
@@ -145,6 +146,7 @@ class Calibration(Brief):
             sensor=SensorMount.of(model.cell),
             covariance_source=covariance_source,
             turn_std=_turn_std(fit),
+            other_temperatures=p.other_temperatures,
         )
         return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
@@ -391,9 +393,9 @@ class Calibration(Brief):
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
             isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in unstated)
             of_tool = by_parameters + scatter
-            if self.mode == "absolute":
+            if self.other_temperatures is not None:
                 axes = prediction.observation.axes
-                warmer = by_other_temperatures(tool.model, states, self.measured.ranges, 3)
+                warmer = self.other_temperatures.of_readings(states, 3, tool.model.cell)
                 of_tool = of_tool + np.swapaxes(axes, 1, 2) @ warmer @ axes
             covariance = turn @ of_tool @ turn.T + isotropic * np.eye(3)
             offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes

@@ -22,7 +22,9 @@ from hilcal.calibration.measured import CONDITION_NAMES, Condition, MeasuredRang
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
+from hilcal.identification.prediction.other_temperatures import OtherTemperatures
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName
@@ -75,8 +77,16 @@ def to_json(c: Calibration) -> dict[str, object]:
         "force_sensor": c.sensor,
         "refuted_by": c.refuted_by,
         "turn_std_rad": c.turn_std,
+        "other_temperatures": _effects_and_covariance(c.other_temperatures),
     }
     return {key: encode(value) for key, value in content.items()}
+
+
+def _effects_and_covariance(warmer: OtherTemperatures | None) -> dict[str, object] | None:
+    if warmer is None:
+        return None
+    effects = [{"name": e.name, "options": dict(e.options)} for e in warmer.unnamed.effects]
+    return {"effects": effects, "covariance": warmer.covariance}
 
 
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
@@ -85,16 +95,22 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
     return read_document(content, "calibration", FORMAT, (FACTOR_VERSION, VERSION), read)
 
 
-def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
-    cell, effects = _cell(content["cell"], decode(Arm, content["arm"])), []
-    for e in content["effects"]:
+def _effects(stored: Any, cell: Cell, catalogue: Catalogue) -> tuple[Effect, ...]:
+    states, out = state_with_every_column(cell), []
+    for e in stored:
         if e["name"] not in catalogue.names:
             raise InputError(
                 f"it has the effect {e['name']}, which is not in the catalogue; give the file "
                 "that defines it: --effects-from FILE.py"
             )
-        effects.append(catalogue.make(e["name"], cell, state_with_every_column(cell), e["options"]))
-    model = Model(cell, tuple(effects), catalogue)
+        out.append(catalogue.make(e["name"], cell, states, e["options"]))
+    return tuple(out)
+
+
+def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
+    cell = _cell(content["cell"], decode(Arm, content["arm"]))
+    effects = _effects(content["effects"], cell, catalogue)
+    model = Model(cell, effects, catalogue)
     names = [f"{e.name}.{p.name}" for e in effects for p in e.parameters]
     limits.check_parameters(len(names))
     if names != content["parameters"]:
@@ -111,6 +127,11 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
         numbers("covariance_root", root, root.shape)
+    measured, warmer = decode(MeasuredRanges, content["measured"]), None
+    if (stored := content.get("other_temperatures")) is not None:
+        unnamed = Model(cell, _effects(stored["effects"], cell, catalogue), catalogue)
+        variances = numbers("covariance", stored["covariance"], (unnamed.size, unnamed.size))
+        warmer = OtherTemperatures(unnamed, variances, measured.ranges)
     stored = dict(content["scatter"])  # older programs wrote `known` alone
     scatter = decode(Scatter, {"source": "stated" if stored["known"] else "unknown"} | stored)
     calibration = Calibration(
@@ -121,13 +142,14 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         covariance_source=source,
         misfit=float(content["misfit_m2"]),
         scatter=scatter,
-        measured=decode(MeasuredRanges, content["measured"]),
+        measured=measured,
         loads=decode(Mapping[str, Floats], content["loads"]),
         source=dict(content["source"]),
         sensor=decode(SensorMount | None, content.get("force_sensor")),
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
         turn_std=float(content.get("turn_std_rad", 0.0)),
         refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),
+        other_temperatures=warmer,
     )
     _check(calibration, cell.arm.n)
     return calibration

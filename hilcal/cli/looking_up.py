@@ -93,8 +93,7 @@ def show(t: Terminal, name: str, catalogue: Catalogue) -> None:
         f"The readings must have {' and '.join(e.needs)}." * bool(e.needs),
         "It depends on the forces in the arm: loads, or poses in which it bears other torques, "
         "show it." * e.elastic,
-        _expected(e).removeprefix("; ").capitalize() + ", as a standard deviation before anything "
-        "is measured."
+        f"E{_expected(e).removeprefix('; e')}, as a standard deviation before anything is measured."
         if expected_sizes(e)
         else "",
         f"A suspect of more than {e.most():g} times the ordinary sizes is not named."

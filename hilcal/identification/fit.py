@@ -220,29 +220,18 @@ class Fit(WithVarianceFactor, Tabular):
 
     @property
     def is_saturated(self) -> bool:
-        """Whether the fit has used more than half of the degrees of freedom of readings or poses.
+        """Whether the fit has used up what the readings tell, so that its residual proves nothing.
 
-        Its residual is then small whatever the arm is, and proves nothing.
+        It has used more than half of their degrees of freedom; or more than half of the mean square
+        error on poses left out comes from the parameters: further loads at the same poses add
+        degrees of freedom, but tell nothing of what does not depend on the load.
         """
-        return max(1.0 - self.dof / self.whitening.rank, self.used_by_poses) > 0.5
+        return self.dof < self.whitening.rank / 2 or self.left_out_over_residual > 2.0
 
-    @cached_property
-    def used_by_poses(self) -> float:
-        """Share that the fit has used of the degrees of freedom of the poses.
-
-        Further loads at a pose tell nothing of what does not depend on the load. With H the hat
-        matrix of n poses with m elements, and M the projection to the mean of each pose's readings,
-        it is tr M H/(n m); 0 where every pose was read once.
-        """
-        pose = np.unique(self.pose, return_inverse=True)[1].reshape(-1)
-        size = np.bincount(pose)
-        if size.max(initial=1) == 1:
-            return 0.0
-        s = self.solution
-        moved = (s.rows @ s.equations.inverse_root(s.beta).T).reshape(len(pose), -1)
-        total = np.zeros((len(size), moved.shape[1]))
-        np.add.at(total, pose, moved)
-        return float(np.sum(total**2 / size[:, None])) / (self.whitening.m * len(size))
+    @property
+    def left_out_over_residual(self) -> float:
+        """Mean square error on poses left out over that of the residual, by degree of freedom."""
+        return self.holdout.rms_sigma**2 / max(self.variance_factor, 1.0)
 
     @property
     def mahalanobis2(self) -> Floats:

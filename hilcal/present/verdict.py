@@ -254,13 +254,14 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
 
 def _few_readings(d: Diagnosis) -> list[str]:
     fit, total = d.fit, d.fit.whitening.rank
-    used = f"{total - fit.dof:.0f} of {total} degrees of freedom"
-    if fit.used_by_poses > 1.0 - fit.dof / total:
-        used = f"{percent(fit.used_by_poses)} of the degrees of freedom of the poses"
+    if fit.dof < total / 2:
+        doubt = f"the fit has used {total - fit.dof:.0f} of {total} degrees of freedom"
+    else:
+        times = np.sqrt(fit.left_out_over_residual)
+        doubt = f"poses left out are off by {times:.1f} times as much: these poses are too few"
     return [
         f"Residuals are what the noise explains: variance factor {fit.variance_factor:.2f}.",
-        f"But the fit has used {used}, so that a missing effect would hardly show. Measure more "
-        "poses.",
+        f"But {doubt}, so that a missing effect would hardly show. Measure more poses.",
     ]
 
 

@@ -50,13 +50,16 @@ from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, ran
 from hilcal.identification.gauss_newton import derivative, whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.noise.arm_scatter import with_missing_scatter
-from hilcal.identification.prediction.other_temperatures import by_other_temperatures
+from hilcal.identification.prediction.other_temperatures import (
+    OtherTemperatures,
+    other_temperatures,
+)
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.families import families_of
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import ArmScatter, Range, Readings, ranges_of
+from hilcal.readings.readings import ArmScatter, Readings, ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement
@@ -196,7 +199,7 @@ class Predictive:
     scatter_m2: float  # `scatter` of a 3-D position, m²
     left_out_m2: float  # `left_out` of a 3-D position, m²
     arm_scatter: ArmScatter | None  # the arm's, estimated, which V contains
-    measured: tuple[Range, ...]  # ranges of the fitted readings
+    other_temperatures: OtherTemperatures | None  # None for deflections, in which these cancel
 
     def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
         """Return the scaling of other readings, with the arm's estimated scatter in V."""
@@ -209,9 +212,9 @@ class Predictive:
         jacobian = w.raw(derivative(self.model, prediction, self.theta, w.m, w.mode))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
         covariance = np.asarray(self.factor * spread)
-        if w.mode == "absolute":
+        if self.other_temperatures is not None:
             states = prediction.situation.states[w.reading]
-            covariance += by_other_temperatures(self.model, states, self.measured, w.m)
+            covariance += self.other_temperatures.of_readings(states, w.m)
         return covariance
 
     def position_m2(self, prediction: Prediction, w: Whitening) -> Floats:
@@ -315,13 +318,15 @@ def predictive(
     )
     by_pose = of_pose.reshape(-1, 3).sum(axis=1)
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
+    warmer = None
+    if mode == "absolute":
+        warmer = other_temperatures(model, fitted, w, a, root, noise)
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
         model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
         open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
-        scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
-        ranges_of(fitted.states, model.cell.arm.units),
+        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, warmer,
     )  # fmt: skip
 
 
