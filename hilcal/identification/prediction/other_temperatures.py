@@ -33,16 +33,15 @@ class OtherTemperatures:
     covariance: Floats  # (L, L) C
     ranges: tuple[Range, ...]  # of the fitted readings
 
-    def of_readings(self, states: States, m: int, cell: Cell | None = None) -> Floats:
+    def of_readings(self, states: States, m: int, cell: Cell) -> Floats:
         """Return Cov (N, m, m) of readings, m = 3 (positions) or 6 (poses), in sensor axes.
 
-        `cell` has another target, unless None.
+        `cell` has the registration and the target, which may be others than those fitted.
         """
         clipped = self._nearest_measured(states)
         if not clipped or not self.unnamed.effects:
             return np.zeros((len(states), m, m))
-        theta, model = np.zeros(self.unnamed.size), self.unnamed
-        model = model if cell is None else replace(model, cell=cell)
+        theta, model = np.zeros(self.unnamed.size), replace(self.unnamed, cell=cell)
         air, joints = states.air_temperature, states.joint_temperature
         # where a temperature is unknown, any constant makes the difference zero
         air = np.zeros(len(states)) if air is None else air

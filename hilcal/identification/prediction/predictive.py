@@ -214,7 +214,7 @@ class Predictive:
         covariance = np.asarray(self.factor * spread)
         if self.other_temperatures is not None:
             states = prediction.situation.states[w.reading]
-            covariance += self.other_temperatures.of_readings(states, w.m)
+            covariance += self.other_temperatures.of_readings(states, w.m, self.model.cell)
         return covariance
 
     def position_m2(self, prediction: Prediction, w: Whitening) -> Floats:

@@ -38,7 +38,7 @@ PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())
 
 COSTLY = (
     *("campaign_fit", "preview", "measured", "krl", "rapid", "inform"),
-    *("discovered", "table", "calibration"),
+    *("discovered", "table"),
 )
 """Parsers that take long: a tenth of the inputs every time, at least six."""
 INPUTS = {name: FEW.get(name, 150) for name in PARSERS}
