@@ -232,6 +232,7 @@ def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
     assert told.deflections == len(rows)
 
 
+@pytest.mark.long
 def test_the_drift_that_returns_tell_is_that_of_a_fit_to_them():
     _, made = _large()
     plan = made[0].plan

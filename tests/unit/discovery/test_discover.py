@@ -209,6 +209,7 @@ def unit_motion(form):
     return ORDINARY[form.parts[0].site.unit]
 
 
+@pytest.mark.long
 def test_the_curve_of_a_law_lies_where_the_readings_are():
     by_angle, by_torque = found().curves
     assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")

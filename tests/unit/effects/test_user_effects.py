@@ -59,6 +59,7 @@ def run_file(table, tmp_path, capsys):
     return path
 
 
+@pytest.mark.long
 def test_it_can_be_fitted_and_added_by_name(run_file, file, capsys):
     mine = ("--effects-from", file)
     chosen = f"joint_compliance,{NAME}"

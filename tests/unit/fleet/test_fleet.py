@@ -111,7 +111,6 @@ def test_shrunk_effects_are_pooled_by_what_the_readings_say_of_them(one):
         pool(unnamed, [])
 
 
-@pytest.mark.long
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
     found = with_odd[1]
     assert found.parameters
@@ -144,6 +143,7 @@ def test_the_prior_of_a_few_arms_is_as_wide_as_their_spread_is_uncertain(one):
     assert 0.9 < np.mean(inside) < 1.0
 
 
+@pytest.mark.long
 def test_in_an_ordinary_fleet_nobody_is_named(one):
     for seed in (11, 12, 13):
         assert pool(members(one, seed), ()).unlike == ()
@@ -332,7 +332,6 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     assert "No arm is unlike the others\n" in rows(path, "/words/type0", "TextDocument:text")[0][0]
 
 
-@pytest.mark.long
 def test_what_others_imitate_only_far_off_is_known():
     """Geometry imitates a joint's compliance, moved by a thousand times its ordinary magnitude."""
     rng = np.random.default_rng(5)
@@ -347,6 +346,7 @@ def test_what_others_imitate_only_far_off_is_known():
     assert found @ [1.0, 0.1] == pytest.approx(0.0, abs=1e-2)
 
 
+@pytest.mark.long
 def test_arms_with_all_their_geometry_have_compliances_near_the_truth():
     """In the fits' over-complete geometry a frame that moves a little moves the compliances."""
     arms, found, truth = 4, [], []

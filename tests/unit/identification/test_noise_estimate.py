@@ -57,6 +57,7 @@ def test_white_noise_of_any_size_is_noise(tmp_path, sigma):
     assert judged(cell, readings).verdict == "adequate"
 
 
+@pytest.mark.long
 def test_effects_are_not_noise(tmp_path):
     """Where the readings show several, the default stays: they are suspects, or unknown."""
     of = measured("ur5", 2, OFF, 60, 1e-5, lambda q: 4e-5 * np.sin(q + 1))

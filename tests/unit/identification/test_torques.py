@@ -35,7 +35,6 @@ def campaign(seed, hung=1.0, friction=2.0):
     return replace(readings, states=replace(p.states, torque=torque))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_load_that_is_not_what_it_is_said_to_be(seed):
     found = check_torques(cell_of(), campaign(seed, hung=0.49))
@@ -50,6 +49,7 @@ def test_a_load_that_is_not_what_it_is_said_to_be(seed):
     np.testing.assert_array_less(found.std_Nm, 2.0)
 
 
+@pytest.mark.long
 def test_right_masses_are_not_accused_and_intervals_keep_their_rate():
     inside, accused, count = 0, 0, 0
     for seed in range(25):

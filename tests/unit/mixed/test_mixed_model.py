@@ -146,7 +146,6 @@ def predict(variances, jacobian):
     return x @ variances.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("groups", [8, 12])
 def test_bands_hold_what_they_say_with_few_rows(groups):
     rng = np.random.default_rng(5)
@@ -159,6 +158,7 @@ def test_bands_hold_what_they_say_with_few_rows(groups):
     assert 0.92 < inside / total < 0.98
 
 
+@pytest.mark.long
 def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is():
     rng = np.random.default_rng(6)
     null = [evidence(drawn(rng, (1.0, 0.0), 0.3, 20)[0], 1, rng).p_value for _ in range(100)]

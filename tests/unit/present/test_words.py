@@ -366,6 +366,7 @@ def test_an_error_falls_by_an_added_effect_only_where_a_diagnosis_says_so():
     assert " falls from " in change_sentence(missing, found, "base_compliance", added=True)
 
 
+@pytest.mark.long
 def test_naming_an_effect_of_the_background_is_no_denial_of_it():
     c = campaign(mode="deflection", seed=1)
     f = fitted_model(c.cell, c.readings, "deflection")
