@@ -312,17 +312,19 @@ class Calibration(Brief):
         turn = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
         if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
             raise InputError("tool is no (4, 4) pose on the flange: a rotation and a position")
-        return tool_of(self.model, self.theta, self._flange @ pose)
+        return tool_of(self.model, self.theta, pose, self._flange)
 
     @cached_property
-    def _flange(self) -> Floats:
-        """(4, 4) the fitted flange, turned about the target as drawn where attitudes are fitted.
+    def _flange(self) -> Floats | None:
+        """(4, 4) the flange as drawn, turned about the target, in axes of the fitted one.
+
+        None where readings have no attitudes: the fitted one.
 
         They do not tell that turn (see `_turn_std`): what is fitted is the mean attitude error of
         the nominal arm, which the target's estimated turn has.
         """
         if not self.turn_std:
-            return np.eye(4)
+            return None
         target = self._tracked.nominal[:3, 3]
         turn = drawn_flange(self.frames.links, self.model.cell.arm.links)[0][:3, :3]
         return se3.matrix(turn, target - turn @ target)

@@ -76,10 +76,16 @@ class ToolPose:
     """Other effects that move base or target, with the slices of their parameters."""
 
 
-def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
-    """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4)."""
+def tool_of(
+    model: Model, theta: Floats, pose: Floats | None, moved: Floats | None = None
+) -> ToolPose:
+    """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4).
+
+    `moved` (4, 4): the flange that the other tool is on, in axes of the fitted one; None: the same.
+    """
     index = np.arange(model.size)
     robot = robot_frames(model, theta)
+    flange = robot.flange if moved is None else robot.flange @ moved
     if pose is None:
         nominal, tool_model, columns = robot.declared[0], model, index
     else:
@@ -87,7 +93,7 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         parts = [index[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in used]
         columns = np.concatenate([index[:0], *parts])
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
-        cell = replace(cell, target=robot.flange @ pose, target_known=True)
+        cell = replace(cell, target=flange @ pose, target_known=True)
         tool_model = replace(model, cell=cell, effects=tuple(used))
     state = state_with_every_column(tool_model.cell)
     if tool_model.cell.targets is not None:
@@ -105,7 +111,7 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         theta=theta[columns],
         columns=columns,
         nominal=nominal,
-        pose=robot.flange @ nominal,
+        pose=flange @ nominal,
         registered=robot.registered,
         base=robot.chain,
         frames=tuple((e, part) for e, part in pairs if e.role == "registration"),

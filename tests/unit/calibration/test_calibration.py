@@ -321,6 +321,13 @@ def test_attitudes_do_not_tell_how_the_flange_is_turned_beside_the_target():
     error, share = error_and_share_inside(calibration, other)
     as_fitted, narrow_share = error_and_share_inside(replace(calibration, turn_std=0.0), other)
     assert (error < 0.7 * as_fitted, share > 0.9, narrow_share < 0.1) == (True, True, True)
+    np.testing.assert_array_equal(calibration.tool_pose(other), other)
+    goal = evaluate(c.cell.arm, states.q).point(other[:3, 3])
+    made = calibration.compensate(states.q, states.wrench, tool=other)
+    reached = c.world.equilibrium(replace(states, q=made.q)).flange @ other
+    reached = (se3.inverse(base) @ c.world.registration @ reached)[:, :3, 3]
+    off = np.linalg.norm(reached - goal, axis=1)
+    assert np.mean(off) == pytest.approx(error, rel=0.1)
     assert from_json(to_json(calibration)).turn_std == calibration.turn_std
 
 
