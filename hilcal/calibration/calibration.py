@@ -52,7 +52,7 @@ from hilcal.identification.prediction.other_temperatures import OtherTemperature
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
     RobotFrames,
-    drawn_flange,
+    nominal_flange,
     robot_frames,
     state_with_every_column,
     whole_turns,
@@ -316,17 +316,16 @@ class Calibration(Brief):
 
     @cached_property
     def _flange(self) -> Floats | None:
-        """(4, 4) the flange as drawn, turned about the target, in axes of the fitted one.
+        """(4, 4) the fitted flange turned about the target to its nominal attitude.
 
-        None where readings have no attitudes: the fitted one.
-
-        They do not tell that turn (see `_turn_std`): what is fitted is the mean attitude error of
+        None where readings have no attitudes. Attitudes of one target do not tell the turn of the
+        flange (see `_turn_std`): what is fitted is the mean attitude error of
         the nominal arm, which the target's estimated turn has.
         """
         if not self.turn_std:
             return None
         target = self._tracked.nominal[:3, 3]
-        turn = drawn_flange(self.frames.links, self.model.cell.arm.links)[0][:3, :3]
+        turn = nominal_flange(self.frames.links, self.model.cell.arm.links)[0][:3, :3]
         return se3.matrix(turn, target - turn @ target)
 
     def _states(
@@ -397,8 +396,8 @@ class Calibration(Brief):
             of_tool = by_parameters + scatter
             if self.other_temperatures is not None:
                 axes = prediction.observation.axes
-                warmer = self.other_temperatures.of_readings(states, 3, tool.model.cell)
-                of_tool = of_tool + np.swapaxes(axes, 1, 2) @ warmer @ axes
+                thermal = self.other_temperatures.of_readings(states, 3, tool.model.cell)
+                of_tool = of_tool + np.swapaxes(axes, 1, 2) @ thermal @ axes
             covariance = turn @ of_tool @ turn.T + isotropic * np.eye(3)
             offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes
             lever = se3.apply(se3.product(rotation, tool.nominal[:3, :3].T), offset)

@@ -77,15 +77,15 @@ class ToolPose:
 
 
 def tool_of(
-    model: Model, theta: Floats, pose: Floats | None, moved: Floats | None = None
+    model: Model, theta: Floats, pose: Floats | None, flange: Floats | None = None
 ) -> ToolPose:
     """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4).
 
-    `moved` (4, 4): the flange that the other tool is on, in axes of the fitted one; None: the same.
+    `flange` (4, 4): that of the other tool, in axes of the fitted one; None: the fitted one.
     """
     index = np.arange(model.size)
     robot = robot_frames(model, theta)
-    flange = robot.flange if moved is None else robot.flange @ moved
+    flange = robot.flange if flange is None else robot.flange @ flange
     if pose is None:
         nominal, tool_model, columns = robot.declared[0], model, index
     else:

@@ -82,11 +82,11 @@ def to_json(c: Calibration) -> dict[str, object]:
     return {key: encode(value) for key, value in content.items()}
 
 
-def _effects_and_covariance(warmer: OtherTemperatures | None) -> dict[str, object] | None:
-    if warmer is None:
+def _effects_and_covariance(thermal: OtherTemperatures | None) -> dict[str, object] | None:
+    if thermal is None:
         return None
-    effects = [{"name": e.name, "options": dict(e.options)} for e in warmer.unnamed.effects]
-    return {"effects": effects, "covariance": warmer.covariance}
+    effects = [{"name": e.name, "options": dict(e.options)} for e in thermal.unnamed.effects]
+    return {"effects": effects, "covariance": thermal.covariance}
 
 
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
@@ -127,11 +127,11 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
         numbers("covariance_root", root, root.shape)
-    measured, warmer = decode(MeasuredRanges, content["measured"]), None
+    measured, thermal = decode(MeasuredRanges, content["measured"]), None
     if (stored := content.get("other_temperatures")) is not None:
         unnamed = Model(cell, _effects(stored["effects"], cell, catalogue), catalogue)
         variances = numbers("covariance", stored["covariance"], (unnamed.size, unnamed.size))
-        warmer = OtherTemperatures(unnamed, variances, measured.ranges)
+        thermal = OtherTemperatures(unnamed, variances, measured.ranges)
     stored = dict(content["scatter"])  # older programs wrote `known` alone
     scatter = decode(Scatter, {"source": "stated" if stored["known"] else "unknown"} | stored)
     calibration = Calibration(
@@ -149,7 +149,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
         turn_std=float(content.get("turn_std_rad", 0.0)),
         refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),
-        other_temperatures=warmer,
+        other_temperatures=thermal,
     )
     _check(calibration, cell.arm.n)
     return calibration

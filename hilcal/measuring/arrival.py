@@ -23,7 +23,7 @@ SPREAD_M = 0.05  # least second singular value of centred positions that determi
 PLAUSIBLE_M = 0.1  # largest distance of a reading from the nominal position of its target, m
 FITS_M = 0.02
 """Largest residual of a reading that fits a registration, m; the errors of arms are smaller."""
-CLEARLY = 3.0
+DOUBTFUL_RATIO = 3.0
 """Distance of a doubtful reading from its place, over the farthest of those that fit. A choice."""
 MOST_OMITTED = 3  # readings that a registration omits at most; else the nominal arm is wrong
 APART_M = 0.05  # largest error of a distance between two readings, m
@@ -68,8 +68,8 @@ class RoughRegistration:
         """Return stored readings that may be of another target, each once, with the reason.
 
         Once the registration is known, readings that do not fit it: farther than `PLAUSIBLE_M`, or,
-        if more than `MIN_READINGS` fit, than `FITS_M` and `CLEARLY` times the farthest of these.
-        Until then, a reading that the next one repeated.
+        if more than `MIN_READINGS` fit, than `FITS_M` and `DOUBTFUL_RATIO` times the farthest of
+        these. Until then, a reading that the next one repeated.
         """
         pose = self.pose()
         if pose is None:
@@ -80,7 +80,7 @@ class RoughRegistration:
         distances = _residuals(pose, places[:, 0], places[:, 1])
         fits, limit = distances[distances <= FITS_M], PLAUSIBLE_M
         if len(fits) > MIN_READINGS:
-            limit = min(max(CLEARLY * float(fits.max()), FITS_M), PLAUSIBLE_M)
+            limit = min(max(DOUBTFUL_RATIO * float(fits.max()), FITS_M), PLAUSIBLE_M)
         for x, far in zip(seen, distances.tolist(), strict=True):
             if far > limit and self._cell.known_targets[x.target] and not x.doubted:
                 x.doubted = True

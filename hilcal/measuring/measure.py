@@ -221,8 +221,8 @@ class Measurer:
         rest_start: float | None = None
         window = SettleWindow(acquire.samples)
         while True:
-            unrest = self._mover.unrest(self._mover.checked_sample())
-            if unrest is not None:
+            not_at_rest = self._mover.why_not_at_rest(self._mover.checked_sample())
+            if not_at_rest is not None:
                 rest_start, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
@@ -236,8 +236,8 @@ class Measurer:
                 reason = (
                     "readings drift. Look for a swinging load, a loose target, a warming tracker"
                 )
-                if unrest is not None:
-                    reason = f"arm: {unrest}. Was it moved by hand, or does something push it?"
+                if not_at_rest is not None:
+                    reason = f"arm: {not_at_rest}. Was it moved by hand, or does something push it?"
                 raise DeviceError(
                     f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}"
                 )

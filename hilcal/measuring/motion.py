@@ -455,7 +455,7 @@ class Mover:
             return f"arm: its clock has stood still for {FROZEN_S:g} s; its data are old"
         return None
 
-    def unrest(self, sample: ArmSample) -> str | None:
+    def why_not_at_rest(self, sample: ArmSample) -> str | None:
         """Return why the arm does not stand at its goal, by a sample, in one line; or None."""
         joint, distance = self._worst(sample.q - (sample.q if self.goal is None else self.goal))
         if not distance <= (limit := self._motion.arrival_rad):

@@ -318,15 +318,15 @@ def predictive(
     )
     by_pose = of_pose.reshape(-1, 3).sum(axis=1)
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
-    warmer = None
+    thermal = None
     if mode == "absolute":
-        warmer = other_temperatures(model, fitted, w, a, root, noise)
+        thermal = other_temperatures(model, fitted, w, a, root, noise)
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
         model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
         open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
-        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, warmer,
+        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, thermal,
     )  # fmt: skip
 
 

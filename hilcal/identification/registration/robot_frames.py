@@ -78,7 +78,7 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
     elif any(cell.known_targets):
         flange = np.eye(4)
     else:
-        flange, links[-2] = drawn_flange(links, nominal)
+        flange, links[-2] = nominal_flange(links, nominal)
         targets = se3.product(se3.inverse(flange)[None], targets)
         links[-1] = nominal[-1]
     registered = se3.inverse(base) @ cell.registration
@@ -96,8 +96,8 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
     )
 
 
-def drawn_flange(links: Floats, nominal: Floats) -> tuple[Floats, Floats]:
-    """Return T_chainflange_flange of the flange as drawn (4, 4), and the link before joint n then.
+def nominal_flange(links: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """Return T_chainflange_flange (4, 4) of the nominal flange, and the link before joint n then.
 
     Both `links` (n + 1, 4, 4), those of a fit and the nominal ones, end at their own flange.
     """
