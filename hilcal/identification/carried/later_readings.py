@@ -6,12 +6,15 @@ are
     y = f(θ_A + R u + F b + D δ) + e + p,    R Rᵀ = κC,  u ~ N(0, 1),  b and δ flat
 
 b the twist of the base where the tracker was set up anew, δ changes of the arm (none to begin
-with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share:
-several loads at one pose then carry less information than as many poses. a + c is κσ², the variance
+with), e ~ N(0, a V) the noise and p = Z s, s ~ N(0, 1), what acts beside the model. That is a
+misfit with the variance c V̄ that all readings of a pose share (several loads at one pose then
+carry less information than as many poses), and effects that are no change of the arm: those of
+temperatures that the earlier campaign did not have (`prediction.other_temperatures`), and those of
+instruments that differ in every campaign, such as a tracker's drift. a + c is κσ², the variance
 factor of the earlier fit at poses left out; the excess over the stated noise, κσ² − 1, is divided
-between a and c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
+between a and c by the residual (`earlier_fit`). The minimum over u, s, b and δ of
 
-    ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
+    ‖y − f − Z s‖² / (a V) + ‖u‖² + ‖s‖²
 
 is rᵀ M r of the linearised problem (`regression.schur`): what the earlier fit does not
 explain. Without any change it follows χ² with as many degrees of freedom as
@@ -140,7 +143,7 @@ class LaterReadings:
     mean: Floats  # (P,) prior mean of its parameters
     lift: Floats  # (P, K) directions that are free: R, and those of the frame
     ridge: Floats  # (K,) 1 for those with a prior, 0 for flat ones
-    poses: Floats  # (R, L) rows of the misfit of each pose, in units of the noise √a
+    nuisance: Floats  # (R, L) rows of Z, in units of the noise √a
     anew: bool  # whether the tracker was set up anew
     frames: int  # number of parameters of frames that are estimated anew, the last ones
     cell: Cell | None  # of the later campaign; None: that of the earlier fit
@@ -165,8 +168,8 @@ class LaterFit:
     model: Model  # that of `later`, and the changes
     mean: Floats  # (P,) prior mean of its parameters
     lift: Floats  # (P, K) directions of u, b and δ
-    ridge: Floats  # (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones
-    coordinates: Floats  # (K + L,) u, b, δ and p
+    ridge: Floats  # (K + L,) of these and of s: 1 for those with a prior, 0 for flat ones
+    coordinates: Floats  # (K + L,) u, b, δ and s
 
     @cached_property
     def theta(self) -> Floats:
@@ -197,7 +200,7 @@ class LaterFit:
         w = self.later.w
         jacobian = self.model.jacobian(self.prediction, self.theta, w.m)
         moved = self.later.scaled(w.whiten(w.raw(jacobian @ self.lift)))
-        return projection(np.hstack([moved, self.later.poses]), self.ridge)
+        return projection(np.hstack([moved, self.later.nuisance]), self.ridge)
 
     @cached_property
     def target(self) -> Floats:
@@ -209,7 +212,7 @@ class LaterFit:
     @property
     def square(self) -> float:
         """The minimised sum of squares."""
-        remaining = self.white - self.later.poses @ self.coordinates[self.lift.shape[1] :]
+        remaining = self.white - self.later.nuisance @ self.coordinates[self.lift.shape[1] :]
         return float(remaining @ remaining + self.ridge @ self.coordinates**2)
 
     @property
@@ -284,7 +287,11 @@ def later_readings(
         readings = with_arm_scatter(later_cell, readings, scatter)
     w = whitening(readings, fit.mode, "gc")
     states, slices = fit.readings[~fit.outlier].states, fit.model.slices()
-    parts = [p for p in zip(fit.model.effects, slices, strict=True) if p[0].role not in flat]
+    parts = [
+        p
+        for p in zip(fit.model.effects, slices, strict=True)
+        if p[0].role not in flat and not _differs(p[0])
+    ]
     if "target" in flat and later_cell.target_known:
         flat.remove("target")
     kinds = fit.model.catalogue.with_role(*flat) if flat else ()
@@ -307,17 +314,19 @@ def later_readings(
     free = np.full(len(size), 1.0 if fit.mode == "deflection" else 0.0)
     ridge = np.concatenate([np.ones(lift.shape[1]), free])
     lift = np.hstack([lift, np.eye(model.size)[:, count:] * size])
-    poses = _pose_rows(earlier, w)
-    return LaterReadings(
-        earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count, cell
-    )
+    later = LaterReadings(
+        earlier, readings, w, model, mean, lift, ridge, _pose_rows(earlier, w), anew,
+        len(mean) - count, cell,
+    )  # fmt: skip
+    unnamed = later.scaled(w.whiten(w.raw(_unnamed_rows(later))))
+    return replace(later, nuisance=np.hstack([later.nuisance, unnamed]))
 
 
 def with_frames_only(later: LaterReadings) -> LaterReadings:
     """Return the setting with the earlier parameters fixed; frames are free."""
     moves = np.any(later.lift[len(later.mean) - later.frames :] != 0.0, axis=0)
-    none = later.poses[:, :0]
-    return replace(later, lift=later.lift[:, moves], ridge=later.ridge[moves], poses=none)
+    none = later.nuisance[:, :0]
+    return replace(later, lift=later.lift[:, moves], ridge=later.ridge[moves], nuisance=none)
 
 
 def directions_beside_frames(later: LaterReadings) -> Floats:
@@ -350,6 +359,28 @@ def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: White
     return w.whiten(w.raw(model.jacobian(prediction, mean, w.m) @ lift))
 
 
+def _differs(effect: Effect | type[Effect]) -> bool:
+    """Whether an effect is of the instruments, and another one in every campaign."""
+    return effect.of_setup and effect.role == "effect" and effect.change is None
+
+
+def _unnamed_rows(later: LaterReadings) -> Floats:
+    """Rows (N, m, L) of effects that act on the later readings and are no change of the arm.
+
+    Those of temperature that the earlier model does not name, where it is warmer or colder than in
+    its readings, and those that differ in every campaign, of their ordinary sizes.
+    """
+    model, states, m = later.model, later.readings.states, later.w.m
+    other = later.earlier.predictive.other_temperatures
+    rows = [] if other is None else [other.rows(states, m, model.cell)]
+    for kind in model.catalogue.effects:
+        if _differs(kind) and kind.computable(states) and kind.applies(model.cell):
+            e = model.catalogue.make(kind.name, model.cell, states, m=m)
+            at = model.predict(states, later.mean)
+            rows.append(model.jacobian_of((e,), at, later.mean, m) * e.magnitudes)
+    return np.concatenate([np.zeros((len(states), m, 0)), *rows], axis=2)
+
+
 def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     """Rows (R, L) of a misfit that is common to the measurements of a pose, with its spread."""
     shared = earlier.pose_variance / earlier.noise
@@ -378,7 +409,7 @@ def fit_later(
     place = dict(zip(map(id, model.effects), model.slices(), strict=True))
     for c, end in zip(changes, np.cumsum(sizes), strict=True):
         lift[place[id(c.effect)], k + end - c.directions.shape[1] : k + end] = c.directions
-    ridge = np.concatenate([later.ridge, np.zeros(sum(sizes)), np.ones(later.poses.shape[1])])
+    ridge = np.concatenate([later.ridge, np.zeros(sum(sizes)), np.ones(later.nuisance.shape[1])])
     mean = np.concatenate([later.mean, np.zeros(len(lift) - len(later.mean))])
     x = np.zeros(len(ridge))
     if start is not None:

@@ -34,13 +34,19 @@ class OtherTemperatures:
     ranges: tuple[Range, ...]  # of the fitted readings
 
     def of_readings(self, states: States, m: int, cell: Cell) -> Floats:
-        """Return Cov (N, m, m) of readings, m = 3 (positions) or 6 (poses), in sensor axes.
+        """Return Cov (N, m, m) of readings; see `rows`."""
+        rows = self.rows(states, m, cell)
+        return np.asarray(rows @ np.swapaxes(rows, 1, 2))
 
-        `cell` has the registration and the target, which may be others than those fitted.
+    def rows(self, states: States, m: int, cell: Cell) -> Floats:
+        """Return a root (N, m, L) of Cov, m = 3 (positions) or 6 (poses), in sensor axes.
+
+        The L columns are of all readings together. `cell` has the registration and the target,
+        which may be others than those fitted.
         """
         clipped = self._nearest_measured(states)
         if not clipped or not self.unnamed.effects:
-            return np.zeros((len(states), m, m))
+            return np.zeros((len(states), m, 0))
         theta, model = np.zeros(self.unnamed.size), replace(self.unnamed, cell=cell)
         air, joints = states.air_temperature, states.joint_temperature
         # where a temperature is unknown, any constant makes the difference zero
@@ -56,8 +62,7 @@ class OtherTemperatures:
         for of_air, of_joints in ((air, joints), measured):
             at = replace(states, air_temperature=of_air, joint_temperature=of_joints)
             columns.append(model.jacobian(model.predict(at, theta), theta, m))
-        moved = columns[0] - columns[1]
-        return np.asarray(moved @ self.covariance @ np.swapaxes(moved, 1, 2))
+        return np.asarray((columns[0] - columns[1]) @ np.linalg.cholesky(self.covariance))
 
     def _nearest_measured(self, states: States) -> dict[str, Floats]:
         """Return the nearest measured temperatures (N,) of variables that leave their ranges."""

@@ -29,14 +29,14 @@ def arm():
     return studied_arm(CONFIG, "ur10e", 0, poses=30)
 
 
-def later(arm, change, seed, *, anew=True, count=15, off=None):
+def later(arm, change, seed, *, anew=True, count=15, off=None, warmer=0.0):
     """Change the arm, measure it again, and compare."""
     rng = np.random.default_rng(seed)
     world = replace(arm.world, physics=change(arm.world.physics))
     if anew:
         registration, station = place_tracker(arm.cell, rng)
         world = replace(world, registration=registration, station=station)
-    readings = remeasured(world, arm.loads, count, rng)
+    readings = remeasured(world, arm.loads, count, rng, warmer)
     if off is not None:
         readings.value[off, :3] += [4e-3, 0.0, -3e-3]
     return find_changes(later_readings(arm.earlier, readings, anew=anew))
@@ -71,6 +71,21 @@ def test_without_a_change_nothing_is_claimed(arm, seed):
     assert found.before.rss == pytest.approx(
         found.before.dof, abs=4 * np.sqrt(2 * found.before.dof)
     )
+
+
+@pytest.mark.slow
+def test_the_growth_at_temperatures_that_were_not_measured_is_no_change():
+    grows = studied_arm(CONFIG, "ur3e", 2, poses=30, more=("thermal_growth",))
+    assert later(grows, lambda p: p, 3, count=30, warmer=5.0).found == ()
+    (found,) = later(grows, zero(3, 1e-3), 3, count=30, warmer=5.0).found
+    assert found.candidate.name == "encoder_offset.j3"
+
+
+def test_the_drift_of_the_tracker_in_one_campaign_is_no_change(arm):
+    rate = -5e-8 * np.array([1.0, 0.5, -1.0, 0.3, -0.3, 0.15])
+    found = later(arm, lambda p: p.with_effect("tracker_drift", rate), 3, count=30)
+    assert found.found == ()
+    assert found.explained
 
 
 @pytest.mark.parametrize("changed", first(1, [False, True]))
