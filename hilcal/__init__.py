@@ -18,6 +18,7 @@ __version__ = "1.0.0"
 _NAMES = {
     "hilcal.calibration.calibration": ("Calibration",),
     "hilcal.campaign.campaign": ("Campaign",),
+    "hilcal.campaign.posteriors": ("load_posterior",),
     "hilcal.cell": ("Cell",),
     "hilcal.diagnosis.comparison": ("Comparison",),
     "hilcal.diagnosis.diagnosis": ("Diagnosis",),
@@ -36,7 +37,6 @@ _NAMES = {
         "fit",
         "fit_stream",
         "import_campaign",
-        "load_posterior",
         "plan",
         "read_table",
         "refine",
@@ -58,6 +58,7 @@ __all__ = ["__version__", *sorted(_PLACES)]
 if TYPE_CHECKING:
     from hilcal.calibration.calibration import Calibration as Calibration
     from hilcal.campaign.campaign import Campaign as Campaign
+    from hilcal.campaign.posteriors import load_posterior as load_posterior
     from hilcal.cell import Cell as Cell
     from hilcal.diagnosis.comparison import Comparison as Comparison
     from hilcal.diagnosis.diagnosis import Diagnosis as Diagnosis
@@ -80,7 +81,6 @@ if TYPE_CHECKING:
     from hilcal.library import fit as fit
     from hilcal.library import fit_stream as fit_stream
     from hilcal.library import import_campaign as import_campaign
-    from hilcal.library import load_posterior as load_posterior
     from hilcal.library import plan as plan
     from hilcal.library import read_table as read_table
     from hilcal.library import refine as refine

@@ -25,7 +25,7 @@ from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps
 from hilcal.identification import fit as fits
 from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior, check_prior
-from hilcal.identification.carried.posterior import Posterior, read_posterior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import Fit
 from hilcal.identification.noise.arm_scatter import with_prior_scatter
 from hilcal.identification.noise.full_covariance import (
@@ -50,7 +50,6 @@ from hilcal.robot.arm import array_of
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan
-from hilcal.store.schema import HEADER
 from hilcal.stream import StreamFit
 from hilcal.stream import fit_stream as fit_all
 from hilcal.tables.files import table_file
@@ -390,37 +389,9 @@ def diagnose(
     return judge_fit(fit, history, say)
 
 
-def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Posterior:
-    """Return the posterior of a campaign, which can be the prior of another one.
-
-    >>> with hc.Campaign.open(RUN) as run:
-    ...     number = run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
-    >>> posterior = hc.load_posterior(RUN)
-    >>> posterior.arm, posterior.effects[0].name
-    ('ur10e', 'joint_compliance')
-
-    Args:
-        path: a campaign file, for its revision in use, or a JSON file of a posterior.
-
-    Raises:
-        InputError: no such file, a file of another kind, or a campaign without a revision.
-        CannotAnswerError: the model has no effect of the arm.
-    """
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            is_campaign = stream.read(len(HEADER)) == HEADER
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    if not is_campaign:
-        return read_posterior(path)
-    with Campaign.open(path, catalogue, read_only=True) as run:
-        return run.posterior()
-
-
 @with_one_blas_thread
 def refine(
-    model: Model | Campaign,
+    model: Model | Fit | Campaign,
     data: Readings | Campaign | None = None,
     readings: str | None = None,
     prior: Posterior | CarriedPrior | None = None,
@@ -440,7 +411,8 @@ def refine(
     `readings`, `prior` and `mode` are as for `fit`.
 
     Args:
-        model: the starting model; or a campaign alone, for its baseline.
+        model: the starting model; or a fit, for its model, its kind of readings and, unless others
+            are given, its readings; or a campaign alone, for its baseline.
         data: readings, as of `read_table`, or a campaign.
         discover: a folder. Where no effect explains the misfit, a law is searched, as by
             `hilcal refine --discover`; the files of laws in the final model are written there.
@@ -455,12 +427,15 @@ def refine(
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
     readings = _either(readings, mode)
+    if isinstance(model, Fit):
+        data = model.readings if data is None else data
+        readings, model = readings or model.mode, model.model
     if isinstance(model, Campaign):
         data = model if data is None else data
         model = baseline(model, data, readings, prior=prior)
     elif data is None:
         raise InputError("a model without readings; valid: refine(model, readings), refine(run)")
-    expect(model, Model, "model", f"{A_MODEL}, or a Campaign")
+    expect(model, Model, "model", f"{A_MODEL}, a Fit, or a Campaign")
     given, kind = _readings(data), _mode(readings, data, model.cell)
     if prior is not None:
         model = _with_prior(model, given, prior)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, command
 from hilcal.cli.planning import answers_of, refuse_unready
 from hilcal.cli.running import measure
@@ -29,7 +28,6 @@ from hilcal.errors import (
 )
 from hilcal.measuring.connect import drivers_of, with_kinematics
 from hilcal.measuring.run import HOW_ON
-from hilcal.names import quoted
 from hilcal.present import calibration as words
 from hilcal.present.diagnosis import verdict_line
 from hilcal.present.live_viewer import LiveViewer
@@ -210,7 +208,7 @@ def _procedure(
         settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
         p = Procedure(output, cell, catalogue, settings)
         p.check_files()
-        return _with_prior(p, stated)
+        return p.with_prior("prior" in stated)
     p = continued(output, cell, catalogue)
     if (p.settings.hide is not None) != rehearse:
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
@@ -227,7 +225,7 @@ def _procedure(
                 f"{option} comes too late: the measurements that it decides are planned already; "
                 "leave it out, or calibrate into another file"
             )
-    p = _with_prior(replace(p, settings=replace(p.settings, **stated)), stated)
+    p = replace(p, settings=replace(p.settings, **stated)).with_prior("prior" in stated)
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
@@ -235,19 +233,6 @@ def _procedure(
             t.notice(f"note: {text}")
     t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
-
-
-def _with_prior(p: Procedure, stated: dict[str, Any]) -> Procedure:
-    """Load the prior, if the campaign may still be fitted."""
-    prior = p.settings.prior
-    if prior is None or p.files.validation.exists():
-        return p
-    if "prior" not in stated and Path(prior).parent != p.run.absolute().parent:
-        raise InputError(
-            f"{p.run}: its prior is {prior!r}; a file that a campaign names is read from the "
-            f"campaign's folder only; confirm it with: --prior {quoted(prior)}"
-        )
-    return replace(p, prior=PriorOptions(Path(prior)).load(p.catalogue))
 
 
 def _refuse_goal(kind: Mode, stated: dict[str, Any], cell: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from hilcal import numbers
 from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.posteriors import load_posterior
 from hilcal.cell import Cell
 from hilcal.cli.options import check_output, check_workers, command
 from hilcal.cli.terminal import Terminal
@@ -181,16 +182,17 @@ class PriorOptions:
     prior: Path | None = None
     prior_of: str = "arm"
     drift: str | None = None
+    prior_revision: int | None = None
 
     def load(self, catalogue: Catalogue) -> CarriedPrior | None:
         """Return the prior; None without `--prior`."""
         if self.prior is None:
             if self.drift is not None:
                 raise InputError("--drift belongs to a prior; give --prior OTHER.hilcal, too")
+            if self.prior_revision is not None:
+                raise InputError("--prior-revision needs a prior; give --prior OTHER.hilcal, too")
             return None
-        from hilcal.library import load_posterior  # imports the whole library
-
-        posterior = load_posterior(self.prior, catalogue)
+        posterior = load_posterior(self.prior, catalogue, self.prior_revision)
         try:
             return carried_prior(posterior, self.prior_of, _drifts(self.drift), catalogue)
         except InputError as error:

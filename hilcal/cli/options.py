@@ -47,6 +47,8 @@ prior | --prior OTHER.hilcal | Prior of the parameters: another campaign, or the
     posterior, as hilcal fleet writes it.
 prior_of | --prior-of KIND | Origin of the prior: arm (this arm) or type (another arm of the same
     type).
+prior_revision | --prior-revision N | Revision of the campaign that is the prior, instead of the
+    one in use.
 drift | --drift A=X,B=X | Expected change of effects since the prior, in their ordinary
     magnitudes.
 cell | CELL.toml | Configuration of the cell.

@@ -412,7 +412,9 @@ def compare(
     t.show(heading(f"{run.name}: {fitting.revision_name(comparison.number)} ({name})"))
     t.show(comparison_report(comparison, run.name, later.name))
     files = words.effect_files(catalogue, comparison.fit.model.names)
-    command = next_command(comparison, str(run), str(later), files) if fittable else None
+    command = None
+    if fittable:
+        command = next_command(comparison, str(run), str(later), files, revision)
     if command is not None:
         t.command(command)
     t.document(comparison_json(comparison, str(run), command))

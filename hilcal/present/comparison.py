@@ -267,9 +267,15 @@ def next_step(c: Comparison, earlier: str) -> str:
 
 
 def next_command(
-    c: Comparison, earlier: str, later: str, effect_files: Sequence[str] = ()
+    c: Comparison,
+    earlier: str,
+    later: str,
+    effect_files: Sequence[str] = (),
+    revision: int | None = None,
 ) -> str | None:
     """Return the command line for the next step; None without one.
+
+    `revision`: that of the earlier campaign where it is not the one in use.
 
     `effect_files`: the options that give a command the files of the effects. Readings that were
     fitted already cannot be fitted with that fit as prior.
@@ -282,7 +288,8 @@ def next_command(
     if c.shared or not (any(o.of_arm for o in possible) or not c.changes.explained):
         return None
     first = f"hilcal refine {quoted(earlier)} {options} && " * (c.number is None)
-    return f"{first}{refit} --prior {quoted(earlier)} {options}"
+    chosen = "" if revision is None else f" --prior-revision {revision}"
+    return f"{first}{refit} --prior {quoted(earlier)}{chosen} {options}"
 
 
 def comparison_json(c: Comparison, earlier: str, command: str | None) -> dict[str, object]:

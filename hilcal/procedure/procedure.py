@@ -26,19 +26,21 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.calibration.measured import with_mean_temperatures
 from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.posteriors import load_posterior
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.planner import Planned, PlanRequest, plan_readings
 from hilcal.design.summary import CheckedPlan, about, checked, remarks, summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried.carried_prior import CarriedPrior
+from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
 from hilcal.identification.noise.arm_scatter import with_arm_scatter
 from hilcal.identification.noise.full_covariance import full_readings
 from hilcal.identification.prediction import validation
 from hilcal.identification.prediction.validation import Acceptance, acceptance, extrapolation
+from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
@@ -113,14 +115,40 @@ class Procedure:
     ) -> "Procedure":
         """Begin a calibration, or resume that of an existing campaign file.
 
-        The options are fields of `Settings`; by default those of the existing calibration.
+        The options are fields of `Settings`; by default those of the existing calibration. `prior`
+        is the path of a campaign or posterior.
         """
         path, config, effects = Path(run), cell.configured(), catalogue or installed()
+        stated = options.get("prior") is not None
+        if stated:
+            expect(options["prior"], (str, Path), "prior", "the path of a campaign or posterior")
+            options["prior"] = str(Path(options["prior"]).absolute())
         if path.exists():
-            stored = continued(path, cell, effects)
-            return replace(stored, settings=replace(stored.settings, **options))
-        default = state.Settings(seed=config.simulation.seed, readings=config.readings_mode)
-        return cls(path, cell, effects, replace(default, **options))
+            begun = continued(path, cell, effects)
+        else:
+            default = state.Settings(seed=config.simulation.seed, readings=config.readings_mode)
+            begun = cls(path, cell, effects, default)
+        return replace(begun, settings=replace(begun.settings, **options)).with_prior(stated)
+
+    def with_prior(self, stated: bool) -> "Procedure":
+        """Return it with the prior that its settings name, if the campaign may still be fitted.
+
+        Raises:
+            InputError: no posterior; or a file elsewhere that nobody stated but the campaign.
+        """
+        prior = self.settings.prior
+        if prior is None or self.files.validation.exists():
+            return self
+        if not stated and Path(prior).parent != self.run.absolute().parent:
+            raise InputError(
+                f"{self.run}: its prior is {prior!r}; a file that a campaign names is read from "
+                f"the campaign's folder only; confirm it with: --prior {quoted(prior)}"
+            )
+        posterior = load_posterior(prior, self.catalogue)
+        try:
+            return replace(self, prior=carried_prior(posterior, "arm", {}, self.catalogue))
+        except InputError as error:
+            raise InputError(f"--prior {prior}: {error}") from None
 
     @property
     def files(self) -> state.Files:

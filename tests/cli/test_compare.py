@@ -78,6 +78,10 @@ def test_the_next_command_is_one_that_can_be_given(site, capsys):
         f"hilcal refine 'a b' {options} && hilcal refine c --prior 'a b' {options}"
     )
     assert next_command(replace(c, shared=3), "a", "b") is None
+    d = ok(capsys, "compare", site.earlier, repaired, "--revision", "1", "--json").document
+    assert f"--prior {site.earlier} --prior-revision 1 " in d["next_command"]
+    refitted = ok(capsys, *d["next_command"].split()[1:], "--json").document
+    assert refitted["verdict"]
     with CampaignFile.open(repaired) as campaign, campaign.transaction() as connection:
         insert_meta(connection, PURPOSE, VALIDATION)
     d = ok(capsys, "compare", site.earlier, repaired, "--json").document

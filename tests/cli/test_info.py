@@ -286,4 +286,7 @@ def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path):
     there.rename(moved)
     there.mkdir()
     (there / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
-    assert hc.Procedure.at(run, hc.Cell.load(moved / "CELL.toml")).next().kind == "measure"
+    cell = hc.Cell.load(moved / "CELL.toml")
+    assert hc.Procedure.at(run, cell).next().kind == "measure"
+    with pytest.raises(hc.InputError, match=r"none\.json: cannot be read"):
+        hc.Procedure.at(run, cell, prior=tmp_path / "none.json")

@@ -88,6 +88,14 @@ def refined(site):
         return hc.refine(hc.baseline(run.cell, run.readings), run.readings)
 
 
+def test_a_fit_is_refined_with_its_kind_of_readings(site):
+    with hc.Campaign.open(site.run, read_only=True) as run:
+        readings, usual = run.readings, run.mode()
+        other = "absolute" if usual == "deflection" else "deflection"
+        first = hc.fit(hc.baseline(run.cell, readings, other), readings, other)
+    assert hc.refine(first, background=False).fit.mode == other
+
+
 @pytest.fixture(scope="module")
 def planned(site):
     return hc.plan(hc.Cell.load(site.cell), poses=3, seed=1)
