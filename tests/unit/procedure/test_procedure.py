@@ -10,11 +10,11 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.improvement import Improvement, refuted
 from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.posteriors import load_posterior
 from hilcal.config.cell import Repeatability
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.rehearsal import simulate_plan
 from hilcal.identification.carried.carried_prior import carried_prior
-from hilcal.library import load_posterior
 from hilcal.present.calibration import REFUTED, improvement_report, validation_lines
 from hilcal.present.html.report import limit_words
 from hilcal.procedure.state import DECIDED, FROZEN
