@@ -48,6 +48,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError, expect
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import derivative
+from hilcal.identification.prediction.collinear_conditions import Proxy
 from hilcal.identification.prediction.other_temperatures import OtherTemperatures
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
@@ -106,6 +107,7 @@ class Calibration(Brief):
     turn_std: float = 0.0
     """rad, about each axis: how far the flange may be turned beside the target, see `_turn_std`."""
     other_temperatures: OtherTemperatures | None = None  # None of deflections, and of old files
+    proxies: tuple[Proxy, ...] = ()  # conditions that may stand for those that the model reads
 
     @cached_property
     def _tracked(self) -> ToolPose:
@@ -147,6 +149,7 @@ class Calibration(Brief):
             covariance_source=covariance_source,
             turn_std=_turn_std(fit),
             other_temperatures=p.other_temperatures,
+            proxies=p.proxies,
         )
         return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
@@ -399,6 +402,11 @@ class Calibration(Brief):
                 thermal = self.other_temperatures.of_readings(states, 3, tool.model.cell)
                 of_tool = of_tool + np.swapaxes(axes, 1, 2) @ thermal @ axes
             covariance = turn @ of_tool @ turn.T + isotropic * np.eye(3)
+            for proxy in self.proxies:
+                other = proxy.applied(states)
+                if other is not None:
+                    moved = self._position(tool, other) - self._position(tool, states)
+                    covariance += proxy.probability * moved[:, :, None] * moved[:, None]
             offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes
             lever = se3.apply(se3.product(rotation, tool.nominal[:3, :3].T), offset)
             across = np.sum(lever**2, axis=1)[:, None, None] * np.eye(3)
@@ -408,6 +416,14 @@ class Calibration(Brief):
             std_m = np.sqrt(np.trace(by_parameters, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, std_m, self.turns))
         return ToolPoses(position, rotation, nominal[1], nominal[0], covariance, outside)
+
+    def _position(self, tool: ToolPose, states: States) -> Floats:
+        """Position (N, 3) of a tool; its change by the load for deflections."""
+        position = tool_poses(tool, tool.model.predict(states, tool.theta))[1]
+        if self.mode == "deflection":
+            unloaded = tool.model.predict(_unloaded(states), tool.theta)
+            position = position - tool_poses(tool, unloaded)[1]
+        return position
 
     @cached_property
     def covariance_root(self) -> Floats:

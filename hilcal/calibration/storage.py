@@ -24,6 +24,7 @@ from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
+from hilcal.identification.prediction.collinear_conditions import Proxy
 from hilcal.identification.prediction.other_temperatures import OtherTemperatures
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
@@ -77,6 +78,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "force_sensor": c.sensor,
         "refuted_by": c.refuted_by,
         "turn_std_rad": c.turn_std,
+        "proxies": c.proxies,
         "other_temperatures": _effects_and_covariance(c.other_temperatures),
     }
     return {key: encode(value) for key, value in content.items()}
@@ -150,6 +152,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         turn_std=float(content.get("turn_std_rad", 0.0)),
         refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),
         other_temperatures=thermal,
+        proxies=decode(tuple[Proxy, ...], content.get("proxies", ())),
     )
     _check(calibration, cell.arm.n)
     return calibration

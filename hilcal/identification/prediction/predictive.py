@@ -50,6 +50,7 @@ from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, ran
 from hilcal.identification.gauss_newton import derivative, whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.noise.arm_scatter import with_missing_scatter
+from hilcal.identification.prediction.collinear_conditions import Proxy, proxies
 from hilcal.identification.prediction.other_temperatures import (
     OtherTemperatures,
     other_temperatures,
@@ -59,7 +60,7 @@ from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.families import families_of
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import ArmScatter, Readings, ranges_of
+from hilcal.readings.readings import ArmScatter, Readings, States, ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement
@@ -200,6 +201,7 @@ class Predictive:
     left_out_m2: float  # `left_out` of a 3-D position, m²
     arm_scatter: ArmScatter | None  # the arm's, estimated, which V contains
     other_temperatures: OtherTemperatures | None  # None for deflections, in which these cancel
+    proxies: tuple[Proxy, ...]  # conditions that may stand for those that the model reads
 
     def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
         """Return the scaling of other readings, with the arm's estimated scatter in V."""
@@ -208,13 +210,20 @@ class Predictive:
         return whitening(replace(scattered, common=readings.common), mode, "gc")
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
-        """Return κ J C Jᵀ (D, m, m) of predicted measurements, and what other temperatures add."""
+        """Return κ J C Jᵀ (D, m, m) of predicted measurements, and what other conditions add."""
         jacobian = w.raw(derivative(self.model, prediction, self.theta, w.m, w.mode))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
         covariance = np.asarray(self.factor * spread)
         if self.other_temperatures is not None:
             states = prediction.situation.states[w.reading]
             covariance += self.other_temperatures.of_readings(states, w.m, self.model.cell)
+        position = prediction.observation.position
+        for proxy in self.proxies:
+            other = proxy.applied(prediction.situation.states)
+            if other is not None:
+                moved = self.model.predict(other, self.theta).observation.position - position
+                moved = w.raw(moved)
+                covariance[:, :3, :3] += proxy.probability * moved[:, :, None] * moved[:, None]
         return covariance
 
     def position_m2(self, prediction: Prediction, w: Whitening) -> Floats:
@@ -321,12 +330,20 @@ def predictive(
     thermal = None
     if mode == "absolute":
         thermal = other_temperatures(model, fitted, w, a, root, noise)
+
+    def log_odds(states: States) -> float:
+        """−Δ_u/2 of the model in states with the conditions of a proxy."""
+        other = w.whiten(residual(fitted, model.predict(states, theta), w)).reshape(-1)
+        along = root.T @ (a.T @ (other - white)) / noise
+        return float(along @ along - (other @ other - white @ white) / noise) / 2
+
+    may_stand = proxies(model, fitted.states, log_odds)
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
         model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
         open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
-        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, thermal,
+        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, thermal, may_stand,
     )  # fmt: skip
 
 

@@ -302,6 +302,45 @@ def test_temperatures_that_were_not_measured_widen_the_band_by_what_they_do():
     np.testing.assert_allclose(share, 1.0, rtol=0.01)
 
 
+def test_conditions_that_changed_together_widen_the_band_where_they_part():
+    """Growth by the air or by what the joints' heat does: one warm-up does not tell."""
+    c = campaign("none", "absolute", 2, poses=20)
+    states, rng = c.readings.states, np.random.default_rng(1)
+    warm_up, alone = np.linspace(0.0, 1.0, len(states)), rng.uniform(size=len(states))
+
+    def calibrated(air):
+        joints = np.tile(22.0 + 15.0 * warm_up[:, None], 6)
+        of = replace(states, time=6000.0 * warm_up, air_temperature=air, joint_temperature=joints)
+        model = baseline(c.cell, replace(c.readings, states=of), "absolute")
+        model = model + model.catalogue.make("thermal_growth", c.cell, of)
+        growth = np.zeros(model.size)
+        growth[-1] = 30e-6
+        moved = model.predict(of, growth).observation.position
+        moved = moved - model.predict(of, 0.0 * growth).observation.position
+        readings = replace(c.readings, states=of, value=c.readings.value + moved)
+        return Calibration.of(fit(model, readings, "absolute"))
+
+    def added_and_motion(k, cold=0.0):
+        """Part of the covariance by the proxies, and |δ|² where the joints are colder."""
+        at, q = np.full(20, 0.9), states.q[:20]
+        of = {"time": 6000.0 * (at - cold), "air_temperature": 20.0 + 4.0 * at}
+        of["joint_temperature"] = np.tile(22.0 + 15.0 * (at - cold)[:, None], 6)
+        both = [x.predict(q, recorded=of) for x in (k, replace(k, proxies=()))]
+        of["air_temperature"] = of["air_temperature"] - 4.0 * cold
+        moved = both[0].position - k.predict(q, recorded=of).position
+        added = both[0].covariance - both[1].covariance
+        return np.trace(added, axis1=1, axis2=2), np.sum(moved**2, axis=1)
+
+    together, apart = calibrated(20.0 + 4.0 * warm_up), calibrated(20.0 + 4.0 * alone)
+    again = from_json(to_json(together))
+    assert np.all(added_and_motion(again)[0] < 1e-15)
+    added, motion = added_and_motion(again, cold=0.9)
+    np.testing.assert_allclose(added, 0.5 * 7 / 8 * motion, rtol=0.05)  # the air is one of eight
+    assert motion.max() > 50e-6**2
+    added, motion = added_and_motion(apart, cold=0.9)
+    assert np.all(added < 0.01 * motion)
+
+
 def test_attitudes_do_not_tell_how_the_flange_is_turned_beside_the_target():
     """The turn of one target on the flange is estimated, so that another tool is less certain."""
     c = campaign("link_geometry", "absolute", 2, poses=20, strength=20.0, m=6)
