@@ -286,6 +286,7 @@ class Path:
         self._rejected, self._removed = [*history.rejected], [*history.removed]
         self._trial, self._regressions = cache(trial), Regressions()
         self._background_tried = False
+        self._searched: list[tuple[str, ...]] = []  # models whose laws were searched again
         scattered = first.readings.arm_scatter is not None
         self._scattered = [first.model.names] if scattered else []
         self.append(first, None)
@@ -329,7 +330,7 @@ class Path:
         changed = True
         while changed:
             self.extend()
-            changed = self.reconsider()
+            changed = self.reconsider() or self._search_again()
             changed = changed or self.add_background() or self.add_remainder() or self.add_scatter()
 
     def extend(self) -> None:
@@ -372,6 +373,34 @@ class Path:
         # the sizes of the background were estimated without the law, and contain a part of it
         refitted = with_background(larger, [*last.fit.model.named, law])
         return self._append_background(larger if refitted is None else refitted, law)
+
+    def _search_again(self) -> bool:
+        """Search a law anew beside the effects added after it; whether another one replaced it.
+
+        A law that was searched without these effects may have terms in their place: one of fewer
+        parameters replaces it unless the error on poses left out rises.
+        """
+        last = self.steps[-1].fit
+        names = last.model.names
+        laws = () if self._laws is None else self._laws.proposed
+        if self._laws is None or names in self._searched or last.model.background:
+            return False
+        self._searched.append(names)
+        for law in laws:
+            if law not in names[:-1] or not self._room:
+                continue
+            bare = remove(last, law)
+            # among the effects of the catalogue it would be found again
+            catalogue = self.steps[0].fit.model.catalogue
+            bare = replace(bare, model=replace(bare.model, catalogue=catalogue))
+            proposed = self._laws.propose(bare, self._say)
+            if proposed is None:
+                continue
+            larger, other = proposed
+            if larger.model.size < last.model.size and not predicts_better(larger, last):
+                self._change(larger, other, law)
+                return True
+        return False
 
     def _add_suspect(self) -> bool:
         """Try the suspects, best first; returns whether one was added.

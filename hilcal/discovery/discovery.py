@@ -492,6 +492,11 @@ class LawSearch:
         self._sources[name] = d.source
         return fit_again(fitted, grown, start=after.theta), name
 
+    @property
+    def proposed(self) -> tuple[str, ...]:
+        """Names of the laws that were proposed."""
+        return tuple(self._sources)
+
     def path(self, name: str) -> Path:
         """Return the file of a law."""
         return self._folder.absolute() / f"{name}.py"

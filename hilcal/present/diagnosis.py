@@ -412,7 +412,7 @@ def refined_laws(s: LawSearch) -> Iterator[Block]:
         if not d.laws:
             yield numbers.sentence(no_law_sentence(d))
         elif (law := d.laws[0]).name not in s.files:
-            yield f"{law.formula} was tried; it did not lower the error on poses left out."
+            yield f"{law.formula} was tried, and is not in the model."
         else:
             yield heading(f"{law.name}: a law that the catalogue does not have")
             yield from _law(law, d, first=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hilcal as hc
+from hilcal.diagnosis.stepwise import add
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery, LawSearch, discover, laws_json
@@ -27,10 +28,10 @@ from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.fit import fit
+from hilcal.identification.fit import fit, fit_again
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import discovery_report, no_law_sentence, refined_laws
-from hilcal.refinement import refine
+from hilcal.refinement import Path, refine
 from studies.unmodelled_laws import law_named, shift
 from tests.support.fit_cases import fitted_model
 from tests.support.rehearsed import rehearsed
@@ -247,6 +248,43 @@ def with_zero(symbol, *more):
     place = next(x for x in screened().sites if x.field == "dq" and x.element == 2)
     both = LawPart(place, Amplitude((other,)), 0), LawPart(place, Amplitude((wave, torque)), 1)
     return Form((*both, *more))
+
+
+@pytest.mark.slow
+def test_a_law_is_searched_again_beside_what_was_added_after_it():
+    """Its first search saw no effect that it hid; a shorter law of the second one replaces it."""
+    longer, of = with_zero("τ_6"), campaign(LAW)
+    tilting = of.model + "joint_tilt_compliance"
+    sizes = np.concatenate([0.0 * of.theta, tilting.effects[-1].magnitudes])
+    moved = [
+        tilting.predict(of.readings.states, x).observation.position for x in (sizes, 0 * sizes)
+    ]
+    tilted = replace(of.readings, value=of.readings.value + moved[0] - moved[1])
+    before = fitted_model(of.model.cell, tilted, of.mode)
+    shorter = Form((replace(longer.parts[1], coefficient=0),))
+
+    def with_law(fitted, form, name):
+        kind = effect_class(source_of_form(form, name), name)
+        model = fitted.model
+        effect = kind(model.cell, fitted.readings.states)
+        start = np.concatenate([fitted.theta, np.zeros(form.count)])
+        return fit_again(fitted, replace(model, effects=(*model.effects, effect)), start=start)
+
+    class Search:
+        proposed = ("longer",)
+
+        def propose(self, fitted, say):
+            assert "longer" not in (*fitted.model.names, *fitted.model.catalogue.names)
+            return with_law(fitted, shorter, "shorter"), "shorter"
+
+    path = Path(before, laws=Search(), background=False)
+    path.append(with_law(before, longer, "longer"), "longer")
+    tilt = "joint_tilt_compliance"
+    path.append(add(path.steps[-1].fit, tilt), tilt)
+    path.complete()
+    replaced = next(x for x in path.steps if x.removed == "longer")
+    assert replaced.added == "shorter"
+    assert replaced.fit.model.names[-2:] == (tilt, "shorter")
 
 
 def test_a_number_that_the_model_absorbs_is_dropped():
