@@ -395,13 +395,17 @@ class Calibration(Brief):
             turn, chain = tool.base[:3, :3], prediction.situation.chain
             point = (position - tool.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
-            isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in unstated)
+            unknown = sum(self.conditions[name].variance_m2 for name in unstated)
+            isotropic = np.full(len(states), self.misfit + unknown)
+            time = self.conditions.get("time")
+            if time is not None and time.high is not None and states.time is not None:
+                isotropic += time.variance_m2 * (states.time > time.high)
             of_tool = by_parameters + scatter
             if self.other_temperatures is not None:
                 axes = prediction.observation.axes
                 thermal = self.other_temperatures.of_readings(states, 3, tool.model.cell)
                 of_tool = of_tool + np.swapaxes(axes, 1, 2) @ thermal @ axes
-            covariance = turn @ of_tool @ turn.T + isotropic * np.eye(3)
+            covariance = turn @ of_tool @ turn.T + isotropic[:, None, None] * np.eye(3)
             for proxy in self.proxies:
                 other = proxy.applied(states)
                 if other is not None:

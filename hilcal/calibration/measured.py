@@ -6,7 +6,8 @@ tool by x − x̄ at measured states then counts as a variance of each axis of t
 
     v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
 
-J is the derivative of p by the parameters, R Rᵀ their covariance.
+J is the derivative of p by the parameters, R Rᵀ their covariance. The same v counts at a time after
+the last reading: what the time did while measuring, as the arm warmed up, it may do anew.
 
 The force sensor is mounted between flange and tool. With R its axes and p its origin in base axes,
 r the load point, and (f, M) the change of its reading by the load, sensor axes:
@@ -111,6 +112,7 @@ class Condition:
 
     mean: Floats  # x̄: a number, or (n,)
     variance_m2: float  # v, m²
+    high: Floats | None = None  # largest measured value; None in older files
 
 
 def missing_columns(model: Model, states: States) -> tuple[str, ...]:
@@ -135,7 +137,8 @@ def conditions_of(
         constant: dict[str, Any] = {name: np.broadcast_to(mean, getattr(sample, name).shape).copy()}
         position, spread = position_and_spread(replace(sample, **constant))
         moved = np.sum((reference[0] - position) ** 2) + np.sum((reference[1] - spread) ** 2)
-        out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(sample)))
+        variance = float(moved) / (3 * len(sample))
+        out[name] = Condition(np.asarray(mean), variance, np.asarray(column.max(axis=0)))
     return out
 
 

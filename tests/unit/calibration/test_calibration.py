@@ -302,6 +302,27 @@ def test_temperatures_that_were_not_measured_widen_the_band_by_what_they_do():
     np.testing.assert_allclose(share, 1.0, rtol=0.01)
 
 
+def test_a_time_after_the_last_reading_is_as_uncertain_as_an_unknown_one():
+    c = campaign("none", "absolute", 2, poses=20)
+    states = c.readings.states
+    readings = replace(c.readings, states=replace(states, joint_temperature=None))
+    model = baseline(c.cell, readings, "absolute")
+    model = model + model.catalogue.make("thermal_joint_drift", c.cell, readings.states)
+    k = Calibration.of(fit(model, readings, "absolute"))
+    k = from_json(to_json(k))
+    last, v = float(states.time.max()), k.conditions["time"].variance_m2
+    at, after = (
+        k.predict(states.q[:5], recorded={"time": np.full(5, t)}) for t in (last, last + 0.001)
+    )
+    assert v > 0.0
+    np.testing.assert_allclose(
+        after.covariance - at.covariance,
+        np.tile(v * np.eye(3), (5, 1, 1)),
+        rtol=1e-3,
+        atol=1e-4 * v,
+    )
+
+
 def test_conditions_that_changed_together_widen_the_band_where_they_part():
     """Growth by the air or by what the joints' heat does: one warm-up does not tell."""
     c = campaign("none", "absolute", 2, poses=20)
