@@ -24,7 +24,7 @@ from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.identification.prediction.collinear_conditions import Proxy
+from hilcal.identification.prediction.collinear_conditions import CONDITIONS, DEGREE, Proxy
 from hilcal.identification.prediction.other_temperatures import OtherTemperatures
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
@@ -236,8 +236,19 @@ def _check(c: Calibration, n: int) -> None:
     for name, x in c.conditions.items():
         if name not in CONDITION_NAMES:
             raise ValueError(f"{name!r} is no condition")
-        numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
+        shape = (n,) if name in ("joint_temperature", "approach") else ()
+        numbers(name, x.mean, shape)
         numbers(f"variance by {name}", x.variance_m2, minimum=0.0)
+        if x.high is not None:
+            numbers(f"largest {name}", x.high, shape)
+    for p in c.proxies:
+        if p.column not in CONDITIONS or not 0 <= p.joint < n or not p.low < p.high:
+            raise ValueError(f"proxy {p.column!r} is no condition with a range")
+        numbers("probability of a proxy", p.probability, minimum=0.0)
+        for name, cubic in p.polynomials.items():
+            if name not in CONDITIONS:
+                raise ValueError(f"{name!r} is no condition")
+            numbers(name, cubic, (DEGREE + 1, *((n,) if name == "joint_temperature" else ())))
     if c.refuted_by is not None and not 0 <= c.refuted_by[0] <= c.refuted_by[1]:
         raise ValueError("refuted_by is not a number of points within their band, and of all")
     for name, wrench in c.loads.items():
