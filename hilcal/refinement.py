@@ -461,12 +461,13 @@ class Path:
         poses left out falls by a share (`background_is_better`); also by more than it scatters from
         pose to pose where, by the verdict `unknown_effect`, they may imitate an effect that the
         catalogue lacks. Where the fit is saturated (`Fit.is_saturated`) its small residual proves
-        nothing: they stay. See `_append_background` for their names.
+        nothing, and neither does what seems unknown beside it: they stay. See `_append_background`
+        for their names.
         """
         last = self.steps[-1]
-        tried = self._background_tried or bool(last.fit.model.background)
+        again = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
-        if not self._background or tried or not self._room or d.wrong_figures:
+        if not self._background or again or not self._room or d.wrong_figures:
             return False
         many = last.fit.readings.value.size > MOST_NOISE_ROWS
         if many and not (d.verdict in UNEXPLAINED_VERDICTS or self._has_many_effects()):
@@ -480,7 +481,9 @@ class Path:
         if d.residual_is_noise and last.fit.readings.arm_scatter is None:
             # The residual of serially correlated noise resembles effects.
             serial = last.fit.readings.serial is not None
-            if serial or (not saturated and p_value_of_others(last.fit) > JOINT_LEVEL):
+            # Estimated noise contains the effects that few poses do not show.
+            tried = saturated or not last.fit.readings.noise_stated
+            if serial or (not tried and p_value_of_others(last.fit) > JOINT_LEVEL):
                 return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
@@ -495,7 +498,7 @@ class Path:
         # effects of a saturated fit were chosen by an error on poses left out that is too small
         if not saturated and not background_is_better(named, fitted):
             return False
-        if d.verdict == "unknown_effect":
+        if d.verdict == "unknown_effect" and not saturated:
             share = explained_share(named, fitted)
             if not predicts_better(named, fitted) or share <= d.predictable_share:
                 return False

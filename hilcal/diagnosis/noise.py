@@ -134,7 +134,9 @@ class NoiseVerdict:
 def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> NoiseVerdict:
     """Judge the noise of a fit without suspects; `predictable`: something predicts the residual."""
     high = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
-    low = float(scipy.stats.chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
+    # Noise that was estimated contains what the fit explains: nobody stated it too large.
+    stated = fit.readings.noise_stated
+    low = stated and float(scipy.stats.chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
     if not high and not low:
         return NoiseVerdict("as_stated")
     differ = repeats is not None and not repeats.interval[0] <= 1 <= repeats.interval[1]

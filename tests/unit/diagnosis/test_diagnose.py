@@ -136,6 +136,20 @@ def test_noise_that_is_stated_far_too_large_is_told_beside_a_background(stated):
     assert "the stated covariance is too large" in message(last.diagnosis)
 
 
+def test_noise_that_was_estimated_is_nowhere_stated_too_large():
+    """A few poses of an arm with gear waves: the estimated noise contains them."""
+    hidden = ("link_geometry", "transmission_error")
+    c = study_case(configuration(), "ur5e", "absolute", hidden, 3.0, 0, n_poses=20)
+    unloaded = c.readings[c.readings.load == 0]
+    large = replace(unloaded, covariance=9.0 * unloaded.covariance)
+    verdicts = {
+        stated: refine(baseline(c.cell, r, "absolute"), r, "absolute").verdict
+        for stated in (True, False)
+        for r in [replace(large, noise_stated=stated)]
+    }
+    assert verdicts == {True: "noise_misjudged", False: "ambiguous"}
+
+
 def test_a_fit_that_uses_most_of_the_readings_proves_nothing():
     c = study_case(configuration(), "ur5e", "absolute", (), 0.0, 1)
     unloaded = c.readings[c.readings.load == 0]
