@@ -406,10 +406,11 @@ class Calibration(Brief):
                 thermal = self.other_temperatures.of_readings(states, 3, tool.model.cell)
                 of_tool = of_tool + np.swapaxes(axes, 1, 2) @ thermal @ axes
             covariance = turn @ of_tool @ turn.T + isotropic[:, None, None] * np.eye(3)
+            here = self._position(tool, states) if self.proxies else position
             for proxy in self.proxies:
                 other = proxy.applied(states)
                 if other is not None:
-                    moved = self._position(tool, other) - self._position(tool, states)
+                    moved = self._position(tool, other) - here
                     covariance += proxy.probability * moved[:, :, None] * moved[:, None]
             offset = tool.nominal[:3, 3] - self._tracked.nominal[:3, 3]  # flange axes
             lever = se3.apply(se3.product(rotation, tool.nominal[:3, :3].T), offset)

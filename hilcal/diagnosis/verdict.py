@@ -25,8 +25,8 @@ The rules, in this order:
    If a share of the misfit is predicted that is negligible in an uncertainty budget
    (`noise.PREDICTABLE`), c holds as well, with that share; rule 4 applies instead of a and b.
 6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise`). Where the
-   arm's repeatability is stated, too, the noise is complete, and wrong. Estimated noise is never too
-   large: it contains what the fit explains.
+   arm's repeatability is stated, too, the noise is complete, and wrong. Estimated noise is never
+   too large: it contains what the fit explains.
 
 Noise that was estimated from the readings (`Readings.noise_stated`) is too large where an effect
 outside the catalogue is missing, and a background takes up a part of it, so that χ² does not show

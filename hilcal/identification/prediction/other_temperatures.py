@@ -34,19 +34,22 @@ class OtherTemperatures:
     ranges: tuple[Range, ...]  # of the fitted readings
 
     def of_readings(self, states: States, m: int, cell: Cell) -> Floats:
-        """Return Cov (N, m, m) of readings; see `rows`."""
-        rows = self.rows(states, m, cell)
-        return np.asarray(rows @ np.swapaxes(rows, 1, 2))
+        """Return Cov (N, m, m) of readings, m = 3 (positions) or 6 (poses), in sensor axes.
+
+        `cell` has the registration and the target, which may be others than those fitted.
+        """
+        moved = self._moved(states, m, cell)
+        return np.asarray(moved @ self.covariance @ np.swapaxes(moved, 1, 2))
 
     def rows(self, states: States, m: int, cell: Cell) -> Floats:
-        """Return a root (N, m, L) of Cov, m = 3 (positions) or 6 (poses), in sensor axes.
+        """Return a root (N, m, L) of Cov whose L columns are of all readings together."""
+        return np.asarray(self._moved(states, m, cell) @ np.linalg.cholesky(self.covariance))
 
-        The L columns are of all readings together. `cell` has the registration and the target,
-        which may be others than those fitted.
-        """
+    def _moved(self, states: States, m: int, cell: Cell) -> Floats:
+        """(N, m, L) change of readings by the parameters, beyond that at measured temperatures."""
         clipped = self._nearest_measured(states)
         if not clipped or not self.unnamed.effects:
-            return np.zeros((len(states), m, 0))
+            return np.zeros((len(states), m, len(self.covariance)))
         theta, model = np.zeros(self.unnamed.size), replace(self.unnamed, cell=cell)
         air, joints = states.air_temperature, states.joint_temperature
         # where a temperature is unknown, any constant makes the difference zero
@@ -62,7 +65,7 @@ class OtherTemperatures:
         for of_air, of_joints in ((air, joints), measured):
             at = replace(states, air_temperature=of_air, joint_temperature=of_joints)
             columns.append(model.jacobian(model.predict(at, theta), theta, m))
-        return np.asarray((columns[0] - columns[1]) @ np.linalg.cholesky(self.covariance))
+        return np.asarray(columns[0] - columns[1])
 
     def _nearest_measured(self, states: States) -> dict[str, Floats]:
         """Return the nearest measured temperatures (N,) of variables that leave their ranges."""
