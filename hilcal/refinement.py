@@ -465,9 +465,9 @@ class Path:
         for their names.
         """
         last = self.steps[-1]
-        again = self._background_tried or bool(last.fit.model.background)
+        tried = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
-        if not self._background or again or not self._room or d.wrong_figures:
+        if not self._background or tried or not self._room or d.wrong_figures:
             return False
         many = last.fit.readings.value.size > MOST_NOISE_ROWS
         if many and not (d.verdict in UNEXPLAINED_VERDICTS or self._has_many_effects()):
@@ -481,9 +481,7 @@ class Path:
         if d.residual_is_noise and last.fit.readings.arm_scatter is None:
             # The residual of serially correlated noise resembles effects.
             serial = last.fit.readings.serial is not None
-            # Estimated noise contains the effects that few poses do not show.
-            tried = saturated or not last.fit.readings.noise_stated
-            if serial or (not tried and p_value_of_others(last.fit) > JOINT_LEVEL):
+            if serial or (not saturated and p_value_of_others(last.fit) > JOINT_LEVEL):
                 return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
