@@ -315,6 +315,7 @@ def test_an_append_that_was_stopped_is_resumed(site, capsys):
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
+@pytest.mark.long
 def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     path, further = site.directory / "run.hilcal", str(further_plan(site))
     config = load_config(site.directory / "cell.toml")

@@ -416,6 +416,7 @@ def test_corrected_points_are_a_frame(site):
     )
 
 
+@pytest.mark.long
 def test_results_are_dictionaries_and_go_to_other_processes(site, refined):
     d = refined.diagnosis
     json.dumps(refined.fit.to_dict(), allow_nan=False)

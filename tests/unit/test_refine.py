@@ -220,6 +220,7 @@ def test_a_prior_of_another_arm_is_left_out():
     assert "The prior was left out" in prior_report(r)[-1]
 
 
+@pytest.mark.long
 def test_a_background_that_cannot_be_tested_leaves_the_revisions(monkeypatch):
     """The whole refinement ended with "the mixed model's equations have no solution"."""
 

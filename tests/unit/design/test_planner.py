@@ -66,6 +66,7 @@ def test_the_plan_is_what_the_design_chose(usual):
     assert 0.9 < usual.design.efficiency <= 1.0
 
 
+@pytest.mark.long
 def test_the_plan_may_be_run_and_is_the_same_every_time(usual):
     config = small()
     plan = usual.ordered.plan

@@ -111,7 +111,7 @@ def test_scores_foretell_what_adding_does(mode):
 
 
 @pytest.mark.parametrize("mode", first(1, MODES))
-@pytest.mark.parametrize("factor", [2.0, 0.5])
+@pytest.mark.parametrize("factor", first(1, [2.0, 0.5]))
 def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
     c = campaign("none", mode, plan_seed=0, poses=6, cycles=3)
     clean = noiseless(c.world, plan(6, 0, 3))
@@ -136,6 +136,7 @@ def test_noise_that_is_stated_far_too_large_is_told_beside_a_background(stated):
     assert "the stated covariance is too large" in message(last.diagnosis)
 
 
+@pytest.mark.long
 def test_noise_that_was_estimated_is_nowhere_stated_too_large():
     """A few poses of an arm with gear waves: the estimated noise contains them."""
     hidden = ("link_geometry", "transmission_error")
@@ -162,6 +163,7 @@ def test_a_fit_that_uses_most_of_the_readings_proves_nothing():
     assert "has used 31 of 54 degrees of freedom" in message(few)
 
 
+@pytest.mark.long
 def test_further_loads_at_few_poses_prove_nothing_of_geometry():
     """Couplings of joints in place of the waves of gears fit 12 poses under five loads as well."""
     hidden = ("link_geometry", "transmission_error")

@@ -235,6 +235,7 @@ def test_no_arm_scatters_by_half_a_millimetre():
     assert "the arm or the target was loose" in words
 
 
+@pytest.mark.long
 def test_nor_where_its_scatter_is_in_the_covariance():
     """As beside a background, whose fit estimates the scatter of any size."""
     cell, readings = scattering(4e-4)
@@ -245,6 +246,7 @@ def test_nor_where_its_scatter_is_in_the_covariance():
     assert "more than an arm's repeatability" in str(d.to_dict()["message"])
 
 
+@pytest.mark.long
 def test_scatter_that_is_stated_is_not_estimated():
     cell, readings = scattering()
     d = diagnose(fitted_model(cell, replace(readings, scatter_stated=True), "absolute"))

@@ -80,6 +80,7 @@ def error(fit, of):
     return float(np.linalg.norm(off, axis=1).mean())
 
 
+@pytest.mark.long
 def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
     added = [step.added for step in found.steps]
     before = found.steps[added.index(BACKGROUND) - 1].fit
@@ -199,6 +200,7 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found):
     assert family_sizes(found.steps[0].fit) == ()
 
 
+@pytest.mark.long
 def test_a_scatter_larger_than_an_arms_is_noise_only_where_repeats_show_it(found):
     """What few poses do not resolve scatters alike; the effects of a background are in doubt."""
     model = replace(found.fit.model, background=frozenset({"joint_stiffening"}))  # not there
@@ -231,6 +233,7 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
     assert sizes[1] == pytest.approx(sizes[0], rel=0.2)
 
 
+@pytest.mark.long
 def test_the_scatter_does_not_depend_on_how_large_the_noise_is_stated(series):
     found, alone = [], []
     for by in (1.0, 25.0):

@@ -141,6 +141,7 @@ def test_the_limit_moves_away_gradually_as_the_bulk_grows_beyond_chance():
         assert far[k] == pytest.approx(factor * far[0])
 
 
+@pytest.mark.long
 def test_a_true_effect_is_not_mistaken_for_gross_errors():
     """A bias of the force sensor, too, which looks like bad unloaded readings, pose after pose."""
     cases = []

@@ -312,6 +312,7 @@ def test_the_reason_is_named_with_the_line_to_write(change, said):
     refusal(said, baseline, PLAIN, of_arm(change), "absolute")
 
 
+@pytest.mark.long
 def test_millimetres_and_swapped_rows_are_named():
     good = of_arm()
     assert "the positions are millimetres" in found_in(replace(good, value=1e3 * good.value))[1]

@@ -352,6 +352,7 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step_s", [7200.0, -7200.0], ids=["forward", "back"])
 def test_a_clock_that_is_set_during_a_session_makes_no_pause_and_hides_none(b, step_s):
     def wall():

@@ -464,6 +464,7 @@ def test_a_target_that_stays_lost_ends_the_run(b, lost):
     assert b.world.calls[-2] == "arm.stop"
 
 
+@pytest.mark.long
 def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
     def hidden():
         if np.allclose(b.world.joints(), POSES["p2"]):
