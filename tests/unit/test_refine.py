@@ -10,7 +10,14 @@ from hilcal import refinement
 from hilcal.diagnosis.background_evidence import background_is_better
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.stepwise import add
-from hilcal.drivers.simulated.injected_effects import hide_effect
+from hilcal.drivers.simulated.injected_effects import (
+    Draw,
+    hide_effect,
+    typical_torque,
+    world_without_effect,
+)
+from hilcal.drivers.simulated.rehearsal import measurement_noise
+from hilcal.drivers.simulated.world import place_tracker
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried.carried_prior import carried_prior
@@ -23,10 +30,20 @@ from hilcal.present.story import prior_report
 from hilcal.present.verdict import message
 from hilcal.refinement import BACKGROUND, MOST_REVISIONS, PRIOR, Path, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
-from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
+from studies.random_campaigns import rehearsal_states
+from tests.support.campaigns import (
+    CampaignPlan,
+    campaign,
+    cell_of,
+    configuration,
+    measured,
+    plan,
+    world_of,
+)
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model, refined
+from tests.support.reflector_cases import each_target, plate
 from tests.support.refusals import refusal
 from tests.support.rows import first
 
@@ -236,3 +253,27 @@ def test_a_background_that_cannot_be_tested_leaves_the_revisions(monkeypatch):
     assert not path.add_background()
     assert len(path.steps) == 1
     assert "the background is left out" in said[-1]
+
+
+@pytest.mark.long
+def test_a_fit_that_has_used_up_its_readings_proves_no_unknown_effect():
+    """A coupling of joints fits 15 poses of three targets in place of the waves of gears."""
+    cell, rng, config = plate(), np.random.default_rng([2, 911]), configuration()
+    spread = config.repeatability.per_joint(cell.arm.n)
+    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=spread)
+    draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
+    physics = world.physics
+    for name in ("link_geometry", "encoder_offset", "transmission_error"):
+        physics = physics.with_effect(name, draw.effect(name, rng))
+    registration, station = place_tracker(cell, rng)
+    world = replace(world, physics=physics, registration=registration, station=station)
+    rng.standard_normal(9)  # so that the campaign is the one in which it was seen
+    loads = [(load.name, load.wrench(cell.gravity)) for load in config.loads[:1]]
+    p = CampaignPlan(*rehearsal_states(cell, 15, loads, rng), ("none", loads[0][0]))
+    some = measured(world, each_target(p), rng, 6)
+    last = refine(baseline(cell, some, "absolute"), some, "absolute")
+    before = next(
+        s for s in last.steps if s.fit.is_saturated and s.diagnosis.reason == "no_suspect"
+    )
+    assert last.fit.model.background
+    assert last.fit.holdout.rms_m < before.fit.holdout.rms_m
