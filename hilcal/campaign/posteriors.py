@@ -1,10 +1,12 @@
-"""`load_posterior`: the posterior of a campaign, from its file or from one of its own."""
+"""`load_posterior`, `load_prior`: the posterior of a campaign from a file, and a prior of it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
 from hilcal.identification.carried.posterior import Posterior, read_posterior
 from hilcal.store.schema import HEADER
 
@@ -42,3 +44,22 @@ def load_posterior(
         return read_posterior(path)
     with Campaign.open(path, catalogue, read_only=True) as run:
         return run.posterior(revision)
+
+
+def load_prior(
+    path: Path,
+    catalogue: Catalogue | None,
+    relation: str = "arm",
+    drift: Mapping[str, float] | None = None,
+    revision: int | None = None,
+) -> CarriedPrior:
+    """Return the prior that a file states for a later campaign; see `carried_prior`.
+
+    Raises:
+        InputError: as of `load_posterior`; or the posterior is no prior in this relation.
+    """
+    posterior = load_posterior(path, catalogue, revision)
+    try:
+        return carried_prior(posterior, relation, drift or {}, catalogue)
+    except InputError as error:
+        raise InputError(f"--prior {path}: {error}") from None

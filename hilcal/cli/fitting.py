@@ -8,7 +8,7 @@ from pathlib import Path
 from hilcal import numbers
 from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
-from hilcal.campaign.posteriors import load_posterior
+from hilcal.campaign.posteriors import load_prior
 from hilcal.cell import Cell
 from hilcal.cli.options import check_output, check_workers, command
 from hilcal.cli.terminal import Terminal
@@ -21,7 +21,7 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.bootstrap import DRAWS, check_draws
 from hilcal.identification.bootstrap import bootstrap as draw_again
-from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.noise.arm_scatter import with_prior_scatter
@@ -192,11 +192,8 @@ class PriorOptions:
             if self.prior_revision is not None:
                 raise InputError("--prior-revision needs a prior; give --prior OTHER.hilcal, too")
             return None
-        posterior = load_posterior(self.prior, catalogue, self.prior_revision)
-        try:
-            return carried_prior(posterior, self.prior_of, _drifts(self.drift), catalogue)
-        except InputError as error:
-            raise InputError(f"--prior {self.prior}: {error}") from None
+        drift = _drifts(self.drift)
+        return load_prior(self.prior, catalogue, self.prior_of, drift, self.prior_revision)
 
 
 NO_PRIOR = PriorOptions()

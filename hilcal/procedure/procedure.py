@@ -26,7 +26,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.calibration.measured import with_mean_temperatures
 from hilcal.campaign.campaign import Campaign
-from hilcal.campaign.posteriors import load_posterior
+from hilcal.campaign.posteriors import load_prior
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.planner import Planned, PlanRequest, plan_readings
@@ -35,7 +35,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError, expect
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.noise.arm_scatter import with_arm_scatter
 from hilcal.identification.noise.full_covariance import full_readings
 from hilcal.identification.prediction import validation
@@ -144,11 +144,7 @@ class Procedure:
                 f"{self.run}: its prior is {prior!r}; a file that a campaign names is read from "
                 f"the campaign's folder only; confirm it with: --prior {quoted(prior)}"
             )
-        posterior = load_posterior(prior, self.catalogue)
-        try:
-            return replace(self, prior=carried_prior(posterior, "arm", {}, self.catalogue))
-        except InputError as error:
-            raise InputError(f"--prior {prior}: {error}") from None
+        return replace(self, prior=load_prior(Path(prior), self.catalogue))
 
     @property
     def files(self) -> state.Files:

@@ -7,8 +7,13 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
-from hilcal.drivers.simulated.injected_effects import hide_effect, world_without_effect
-from hilcal.drivers.simulated.rehearsal import simulate
+from hilcal.drivers.simulated.injected_effects import (
+    Draw,
+    hide_effect,
+    typical_torque,
+    world_without_effect,
+)
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
@@ -73,6 +78,18 @@ def world_of(cell, rng):
     along, across = (t.range_std_m, t.range_std_per_m), (t.transverse_std_m, t.transverse_std_per_m)
     noise = SimulatedNoise(along, across, t.orientation_std_rad)
     return world_without_effect(cell, rng, noise=noise, joint_std=joint_std)
+
+
+def world_with_gears(cell, rng):
+    """The demo's arm with errors of links, zeros and gears of ordinary size, and its noise."""
+    config = configuration()
+    spread = config.repeatability.per_joint(cell.arm.n)
+    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=spread)
+    draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
+    physics = world.physics
+    for name in ("link_geometry", "encoder_offset", "transmission_error"):
+        physics = physics.with_effect(name, draw.effect(name, rng))
+    return replace(world, physics=physics)
 
 
 @cache

@@ -11,12 +11,8 @@ from hilcal.diagnosis.background_evidence import background_is_better
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.stepwise import add
 from hilcal.drivers.simulated.injected_effects import (
-    Draw,
     hide_effect,
-    typical_torque,
-    world_without_effect,
 )
-from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.world import place_tracker
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
@@ -39,6 +35,7 @@ from tests.support.campaigns import (
     measured,
     plan,
     world_of,
+    world_with_gears,
 )
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.effect_cases import make
@@ -258,17 +255,12 @@ def test_a_background_that_cannot_be_tested_leaves_the_revisions(monkeypatch):
 @pytest.mark.long
 def test_a_fit_that_has_used_up_its_readings_proves_no_unknown_effect():
     """A coupling of joints fits 15 poses of three targets in place of the waves of gears."""
-    cell, rng, config = plate(), np.random.default_rng([2, 911]), configuration()
-    spread = config.repeatability.per_joint(cell.arm.n)
-    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=spread)
-    draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
-    physics = world.physics
-    for name in ("link_geometry", "encoder_offset", "transmission_error"):
-        physics = physics.with_effect(name, draw.effect(name, rng))
+    cell, rng = plate(), np.random.default_rng([2, 911])
+    world = world_with_gears(cell, rng)
     registration, station = place_tracker(cell, rng)
-    world = replace(world, physics=physics, registration=registration, station=station)
+    world = replace(world, registration=registration, station=station)
     rng.standard_normal(9)  # so that the campaign is the one in which it was seen
-    loads = [(load.name, load.wrench(cell.gravity)) for load in config.loads[:1]]
+    loads = [(load.name, load.wrench(cell.gravity)) for load in configuration().loads[:1]]
     p = CampaignPlan(*rehearsal_states(cell, 15, loads, rng), ("none", loads[0][0]))
     some = measured(world, each_target(p), rng, 6)
     last = refine(baseline(cell, some, "absolute"), some, "absolute")

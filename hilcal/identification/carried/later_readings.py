@@ -290,7 +290,7 @@ def later_readings(
     parts = [
         p
         for p in zip(fit.model.effects, slices, strict=True)
-        if p[0].role not in flat and not _differs(p[0])
+        if p[0].role not in flat and not _differs_by_campaign(p[0])
     ]
     if "target" in flat and later_cell.target_known:
         flat.remove("target")
@@ -359,7 +359,7 @@ def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: White
     return w.whiten(w.raw(model.jacobian(prediction, mean, w.m) @ lift))
 
 
-def _differs(effect: Effect | type[Effect]) -> bool:
+def _differs_by_campaign(effect: Effect | type[Effect]) -> bool:
     """Whether an effect is of the instruments, and another one in every campaign."""
     return effect.of_setup and effect.role == "effect" and effect.change is None
 
@@ -374,7 +374,7 @@ def _unnamed_rows(later: LaterReadings) -> Floats:
     other = later.earlier.predictive.other_temperatures
     rows = [] if other is None else [other.rows(states, m, model.cell)]
     for kind in model.catalogue.effects:
-        if _differs(kind) and kind.computable(states) and kind.applies(model.cell):
+        if _differs_by_campaign(kind) and kind.computable(states) and kind.applies(model.cell):
             e = model.catalogue.make(kind.name, model.cell, states, m=m)
             at = model.predict(states, later.mean)
             rows.append(model.jacobian_of((e,), at, later.mean, m) * e.magnitudes)

@@ -337,13 +337,13 @@ def predictive(
         along = root.T @ (a.T @ (other - white)) / noise
         return float(along @ along - (other @ other - white @ white) / noise) / 2
 
-    may_stand = proxies(model, fitted.states, log_odds)
+    alternatives = proxies(model, fitted.states, log_odds)
     root = space.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
         model, theta, root @ root.T + by_variances @ by_variances.T, by_variances,
         open_prior(model, theta, prior), extra, noise, factor, least, by_pose, scatter, left_out,
-        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, thermal, may_stand,
+        scatter_m2, 3 * left_out_m2, fitted.arm_scatter, thermal, alternatives,
     )  # fmt: skip
 
 

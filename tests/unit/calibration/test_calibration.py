@@ -174,6 +174,8 @@ def test_a_calibration_of_an_arm_of_unknown_payload_and_torques_comes_back(tmp_p
 def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
     c, mirror = calibrated("none"), np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()
     good, exact = to_json(c), {**c.covariance_source.to_json(), "noise": 0.0}
+    proxy = {"column": "time", "joint": 0, "low": 0.0, "high": 9.0, "polynomials": {}}
+    torque = {**proxy, "column": "torque", "probability": 0.1}
     path = tmp_path / "c.json"
     for content, words in [
         ("{", "no calibration"),
@@ -186,6 +188,8 @@ def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
         (json.dumps({k: v for k, v in good.items() if k != "arm"}), "damaged"),
         (json.dumps({**good, "source": None}), "damaged"),
         (json.dumps({**good, "refuted_by": [3, 2]}), "damaged"),
+        (json.dumps({**good, "proxies": [torque]}), "proxy 'torque' is no condition"),
+        (json.dumps({**good, "proxies": [{**proxy, "probability": -0.1}]}), "probability"),
         (json.dumps({**good, "learnt": exact}), "noise has a number that is out"),
         (json.dumps({**good, "cell": {**good["cell"], "target": mirror}}), "a rotation"),
     ]:

@@ -14,8 +14,6 @@ from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.unknown_law import without_remainder
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.injected_effects import Draw, typical_torque, world_without_effect
-from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.rehearsal import simulate as simulate_readings
 from hilcal.effects.catalogue import installed
 from hilcal.effects.protocol import EffectSpec
@@ -54,7 +52,7 @@ from studies.random_descriptions import readings_of
 from studies.study_cases import study_case, with_study_loads
 from tests.support.arm_cases import arm_of
 from tests.support.arm_cases import cell_of as arm_cell
-from tests.support.campaigns import configuration
+from tests.support.campaigns import configuration, world_with_gears
 from tests.support.fit_cases import fitted_model, refined
 from tests.support.refusals import refusal
 
@@ -594,15 +592,9 @@ def arm_with_gears(seed, poses):
     config, rng = configuration(), np.random.default_rng([seed, 4242])
     cell = cell_from_config(config)
     loads = [(load.name, load.wrench(cell.gravity)) for load in config.loads][1:2]
-    joint_std = config.repeatability.per_joint(cell.arm.n)
-    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=joint_std)
-    draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
-    physics = world.physics
-    for name in ("link_geometry", "encoder_offset", "transmission_error"):
-        physics = physics.with_effect(name, draw.effect(name, rng))
+    world = world_with_gears(cell, rng)
     states, pose, load, cycle = rehearsal_states(cell, 100, loads, rng)
     names = ("none", *(name for name, _ in loads))
-    world = replace(world, physics=physics)
     r = simulate_readings(world, states, pose, load, cycle, names, rng)
     return cell, r[r.pose < poses], r[r.pose >= poses]
 
