@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
@@ -250,7 +252,14 @@ def next_step(c: Comparison, earlier: str) -> str:
     if c.another_arm:
         return "calibrate it separately."
     if not changes.found and changes.explained:
-        return f"nothing; the calibration of {earlier} holds."
+        sizes = [x.moved_m for x in changes.limits if x.change.listed and x.moved_m < np.inf]
+        holds = f"nothing; the calibration of {earlier} holds"
+        if not sizes:
+            return f"{holds}."
+        least = numbers.length(max(sizes))
+        return (
+            f"{holds}; a change of a joint that moves the target by less than {least} may not show."
+        )
     arm = [x for x in changes.found if any(o.of_arm for o in x.possible)]
     if changes.explained and changes.found and not arm:
         return f"correct the setup, and compare again; the calibration of {earlier} holds."

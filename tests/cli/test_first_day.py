@@ -332,3 +332,4 @@ def test_the_table_of_a_colleague_tells_the_same(day):
     day.at("validate", RUN, "theirs.hilcal", "--limit", "0.1 mm")
     compared = day.at("compare", RUN, "theirs.hilcal")
     assert "Nothing has changed beyond the uncertainty." in compared.text
+    assert 0.01 < compared.number(r"move the target by less than ([\d.]+) mm may") < 1.0
