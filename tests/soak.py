@@ -490,12 +490,12 @@ EVERY = 40
 def soak(seconds: float, seed: int, folder: Path, say: Callable[[str], None] = print) -> Soak:
     """Do things for so long."""
     s = Soak(Random(seed), folder)
-    end, told = time.monotonic() + seconds, 0
+    end, last_report = time.monotonic() + seconds, 0
     try:
         while time.monotonic() < end:
             s.act()
-            if len(s.findings) > told:
-                told = len(s.findings)
+            if len(s.findings) > last_report:
+                last_report = len(s.findings)
                 say(f"FOUND {s.findings[-1]}")
             if sum(s.counts[w] for w in ("one_fault", "two_faults", "signal")) % EVERY == EVERY - 1:
                 s.close()

@@ -31,6 +31,6 @@ def pytest_terminal_summary(terminalreporter):
 def pytest_collection_modifyitems(items):
     """Refuse what `make bench` would skip silently."""
     for item in items:
-        mine = item.path.parent == Path(__file__).parent
-        if mine and "benchmark" not in getattr(item, "fixturenames", ()):
+        is_benchmark = item.path.parent == Path(__file__).parent
+        if is_benchmark and "benchmark" not in getattr(item, "fixturenames", ()):
             raise pytest.UsageError(f"{item.nodeid} does not use the fixture `benchmark`")

@@ -79,5 +79,5 @@ def test_diagnosing_what_nothing_explains(mode, benchmark, claim):
     benchmark.extra_info["diagnose_s"] = seconds
     what = f"1000 {mode} readings of twice the stated noise: the whole diagnosis, s"
     claim(what, f"{seconds:.2f}", "aim: 1")
-    told = benchmark.pedantic(diagnose, args=(found,), rounds=1)
-    assert told.verdict == "noise_misjudged"
+    diagnosis = benchmark.pedantic(diagnose, args=(found,), rounds=1)
+    assert diagnosis.verdict == "noise_misjudged"

@@ -54,8 +54,12 @@ def test_until_the_page_can_be_used(content, tmp_path, benchmark, claim):
         return loaded, load_work, drawn, draw_work
 
     times = benchmark.pedantic(shown, rounds=1)
-    told = "load event after {:.0f} ms ({:.0f} of work), first chart after {:.0f} ms ({:.0f})"
-    claim("report of 10,000 readings, shown", told.format(*times), "1.5 s on a quiet machine")
+    summary_text = (
+        "load event after {:.0f} ms ({:.0f} of work), first chart after {:.0f} ms ({:.0f})"
+    )
+    claim(
+        "report of 10,000 readings, shown", summary_text.format(*times), "1.5 s on a quiet machine"
+    )
 
 
 def work_of(client):
@@ -65,12 +69,12 @@ def work_of(client):
 
 
 def test_recording_of_ten_thousand_readings(tmp_path, benchmark, claim):
-    told, path = story(poses=2500, loads=4), tmp_path / "x.rrd"
+    campaign_story, path = story(poses=2500, loads=4), tmp_path / "x.rrd"
     walls, works = [], []
 
     def written():
         begun, work = time.perf_counter(), time.process_time()
-        save(told, path)
+        save(campaign_story, path)
         walls.append(time.perf_counter() - begun)
         works.append(time.process_time() - work)
 

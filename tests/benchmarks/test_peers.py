@@ -222,17 +222,17 @@ def test_least_squares(benchmark, claim):
         off = model.predict(states, theta).observation.position - truth
         return 1e6 * float(np.linalg.norm(off, axis=1).mean())
 
-    own, seconds = timed(lambda: solve(model, readings, w, prior=flat))
+    solution, seconds = timed(lambda: solve(model, readings, w, prior=flat))
     benchmark.pedantic(solve, args=(model, readings, w), kwargs={"prior": flat}, rounds=3)
-    least = float(own.white @ own.white)
-    figures = {"steps": own.iterations, "χ²": least, ERROR: error(own.theta)}
+    least = float(solution.white @ solution.white)
+    figures = {"steps": solution.iterations, "χ²": least, ERROR: error(solution.theta)}
     table = [Row("hilcal: Gauss-Newton", seconds, figures)]
     everything = np.diag(scales_of(model))
     cases = [
-        ("trf, exact Jacobian", "trf", True, own.transform),
-        ("trf, 2-point Jacobian", "trf", False, own.transform),
-        ("lm, exact Jacobian", "lm", True, own.transform),
-        ("lm, 2-point Jacobian", "lm", False, own.transform),
+        ("trf, exact Jacobian", "trf", True, solution.transform),
+        ("trf, 2-point Jacobian", "trf", False, solution.transform),
+        ("lm, exact Jacobian", "lm", True, solution.transform),
+        ("lm, 2-point Jacobian", "lm", False, solution.transform),
         ("lm, exact Jacobian, all", "lm", True, everything),
     ]
     for name, method, exact, basis in cases:
@@ -253,9 +253,9 @@ def test_least_squares(benchmark, claim):
         theta = basis @ found.x
         figures = {"steps": found.nfev, "χ²": 2 * found.cost, ERROR: error(theta)}
         table.append(Row(f"SciPy: {name}", seconds, figures))
-        if basis is own.transform:
+        if basis is solution.transform:
             assert 2 * found.cost == pytest.approx(least, rel=1e-4)
-    what = f"{len(readings)} positions, {own.transform.shape[1]} of {model.size} coordinates"
+    what = f"{len(readings)} positions, {solution.transform.shape[1]} of {model.size} coordinates"
     record(benchmark, claim, "least squares", what, table)
 
 

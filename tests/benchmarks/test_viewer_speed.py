@@ -106,7 +106,7 @@ def test_ten_thousand_readings_are_shown_as_fluently_as_a_hundred(
 
     few, many = benchmark.pedantic(measured, rounds=1)
     ratios = [b / a for a, b in zip(few, many, strict=True)]
-    told = "turned {:.2f} ({:.0f} ms), time dragged {:.2f} ({:.0f} ms) times 100 readings"
-    words = told.format(ratios[0], many[0], ratios[1], many[1])
+    summary_text = "turned {:.2f} ({:.0f} ms), time dragged {:.2f} ({:.0f} ms) times 100 readings"
+    words = summary_text.format(ratios[0], many[0], ratios[1], many[1])
     claim(f"viewer with 10,000 readings, {make.__name__}", words, f"{MOST:g}")
     assert max(ratios) <= MOST

@@ -55,9 +55,9 @@ def test_a_goal_needs_readings_that_show_it(there, cell, capsys):
         line = refused(capsys, 2, *command, "--goal", "0.1 mm")
         assert 'readings = "absolute"' in line
     assert not cell.with_name("run.hilcal").exists()
-    told = " ".join(ok(capsys, *command, "--limit", "1 mm").out.split())
-    assert "PASSED for deflections: " in told
-    assert "geometry is not calibrated" in told
+    printed = " ".join(ok(capsys, *command, "--limit", "1 mm").out.split())
+    assert "PASSED for deflections: " in printed
+    assert "geometry is not calibrated" in printed
 
 
 def test_the_plain_command_says_what_is_there(there, capsys):
@@ -70,15 +70,15 @@ def test_the_plain_command_says_what_is_there(there, capsys):
     for late in too_late.items():
         assert f"{late[0]} comes too late" in refused(capsys, 2, *again, *late)
     ok(capsys, *again, "--poses", "4", "--validation", "4")  # as it was begun
-    told = run(capsys, *again, "--skip", "v1")
-    assert (told.code, "none is missing" in told.err) == (2, True)
+    result = run(capsys, *again, "--skip", "v1")
+    assert (result.code, "none is missing" in result.err) == (2, True)
 
 
 def test_a_complete_one_is_told_again(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
-    told = ok(capsys, *command)
-    words = " ".join(told.out.split())
+    result = ok(capsys, *command)
+    words = " ".join(result.out.split())
     assert "At the corrected joint targets the arm is off by" in words
     assert "4 points" in words
     d = ok(capsys, *command, "--json").document
@@ -122,8 +122,8 @@ def test_what_fits_refuses_a_validation_campaign(there, capsys):
     assert "never fitted" in ok(capsys, "validate", there.procedure.run, path).out
     kept = path.read_bytes()
     try:
-        told = ok(capsys, "identify", path, "--fit-validation")
-        assert "A VALIDATION CAMPAIGN IS FITTED" in told.err
+        result = ok(capsys, "identify", path, "--fit-validation")
+        assert "A VALIDATION CAMPAIGN IS FITTED" in result.err
         assert ok(capsys, "diagnose", path).code == 0
     finally:
         path.write_bytes(kept)
@@ -185,16 +185,16 @@ def test_a_factory_check_goes_on_with_what_it_lacks(tmp_path, capsys, monkeypatc
         (("--yes",), 2, "24 readings are judged"),
         ((), 2, "24 readings are judged"),  # nothing is missing
     ):
-        told = run(capsys, *words, *more)
-        assert (told.code, said in told.err) == (code, True), told.err
+        result = run(capsys, *words, *more)
+        assert (result.code, said in result.err) == (code, True), result.err
     # nor is another arm's controller compared with it
-    mine, other = (
+    of_this_arm, other = (
         ConnectionResult("arm", "ur", Report("arm", "UR", facts=(("serial number", n),)))
         for n in ("1", "2")
     )
     with CampaignFile.open(path) as campaign:
-        RunLog(campaign).event("devices", {"answers": [planning.answer_json(mine)]})
-    for answer, said in ((mine, "24 readings are judged"), (other, "number is 2, and the")):
+        RunLog(campaign).event("devices", {"answers": [planning.answer_json(of_this_arm)]})
+    for answer, said in ((of_this_arm, "24 readings are judged"), (other, "number is 2, and the")):
         monkeypatch.setattr(planning, "answers_of", lambda t, config, found=answer: (found,))
         assert said in run(capsys, *words).err
 
@@ -221,9 +221,9 @@ def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(tmp_path, 
     with CampaignFile.open(out) as file:
         log = ProcedureLog(file)
         log.append(BEGUN, {"settings": {**log.last(BEGUN)["settings"], "prior": str(elsewhere)}})
-    told = run(capsys, "calibrate", path, "-o", out, "--yes", "--resume")
-    assert told.code == 2
-    assert f"--prior {elsewhere}" in told.err
+    outcome = run(capsys, "calibrate", path, "-o", out, "--yes", "--resume")
+    assert outcome.code == 2
+    assert f"--prior {elsewhere}" in outcome.err
     again = refused(capsys, 2, "calibrate", path, "-o", out, "--yes")
     assert '"Measure" (16 of 16 readings are missing)' in again
 

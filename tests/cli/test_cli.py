@@ -221,8 +221,8 @@ def test_what_is_stored_already_is_not_stored_again(campaign, capsys):
 def test_validate_finds_the_place_of_a_tracker_that_was_set_up_anew(campaign, tmp_path, capsys):
     ok(capsys, "refine", campaign)
     r = rehearsal("hysteresis")
-    seen, rng = r.readings, np.random.default_rng(3)
-    state = seen.states, seen.pose, seen.load, seen.cycle, seen.load_names
+    readings, rng = r.readings, np.random.default_rng(3)
+    state = readings.states, readings.pose, readings.load, readings.cycle, readings.load_names
     moved = np.eye(4)
     moved[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     moved[:3, 3] = 2.0, 1.5, -0.4

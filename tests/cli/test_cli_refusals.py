@@ -106,10 +106,10 @@ def test_fewer_readings_than_parameters(tmp_path, capsys):
 
 def test_a_busy_port_is_refused(campaign, capsys):
     ok(capsys, "identify", campaign)
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        line = refused(capsys, 2, "view", campaign, "--port", str(taken.getsockname()[1]))
+    with socket.socket() as occupied:
+        occupied.bind(("127.0.0.1", 0))
+        occupied.listen()
+        line = refused(capsys, 2, "view", campaign, "--port", str(occupied.getsockname()[1]))
     assert "port" in line
 
 
@@ -198,9 +198,9 @@ def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     monkeypatch.setattr("hilcal.cli.simulating.simulated_cell", started)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
-    told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)
+    result = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)
     warning = f'{hidden} cancels in them; to show it, set readings = "absolute"'
-    warned = warning in " ".join(told.err.split())
+    warned = warning in " ".join(result.err.split())
     assert warned == said
 
 

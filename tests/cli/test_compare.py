@@ -98,8 +98,8 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys)
     assert d["tracker"] == "anew"
     assert d["error"]["rms_m"] < 2 * d["expected_m"]
     assert d["not_to_be_seen"][0] == "encoder_offset.j1"
-    seen = {row["candidate"]: row["size"] for row in d["would_have_been_seen"]}
-    assert 0 < seen["encoder_offset.j3"] < 2e-4
+    detectable = {row["candidate"]: row["size"] for row in d["would_have_been_seen"]}
+    assert 0 < detectable["encoder_offset.j3"] < 2e-4
     d = ok(capsys, "compare", site.earlier, repaired, "--json").document
     (change,) = d["changes"]
     assert change["part"] == "joint 3"
@@ -117,8 +117,8 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys)
     d = ok(capsys, *command.split()[1:], "--json").document
     assert d["prior"]["effects"][0]["moved_sigma"] > 5
     for other, asks in ((same, False), (repaired, True)):
-        told = ok(capsys, "validate", site.earlier, other, "--register").out
-        assert ("hilcal compare says what has changed" in told) is asks
+        printed = ok(capsys, "validate", site.earlier, other, "--register").out
+        assert ("hilcal compare says what has changed" in printed) is asks
 
 
 @pytest.mark.long
@@ -152,14 +152,16 @@ def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(si
 
 def test_what_cannot_be_compared_is_refused_in_one_line(site, capsys):
     readings = site.measured(3)
-    own = site.store("own.hilcal", site.arm.earlier.fit.readings[:30])
-    assert "was fitted to all its 30 readings" in refused(capsys, 4, "compare", site.earlier, own)
+    same_readings = site.store("own.hilcal", site.arm.earlier.fit.readings[:30])
+    assert "was fitted to all its 30 readings" in refused(
+        capsys, 4, "compare", site.earlier, same_readings
+    )
     q = readings.states.q * [1, 1, -1, 1, 1, 1]
     turned = replace(readings, states=replace(readings.states, q=q))
     flipped = site.store("flipped.hilcal", turned)
     assert "joint 3 turns the other way" in refused(capsys, 2, "compare", site.earlier, flipped)
-    told = site.config.with_keys("robot", model="ur3e")
-    other = site.store("other.hilcal", readings, told)
+    other_config = site.config.with_keys("robot", model="ur3e")
+    other = site.store("other.hilcal", readings, other_config)
     assert "another arm (ur3e)" in refused(capsys, 2, "compare", site.earlier, other)
 
 
@@ -258,13 +260,13 @@ def test_deflection_and_absolute_revisions_stand_in_no_column_together(tmp_path,
         ok(capsys, "identify", run, "--readings", kind, "--effects", "joint_compliance")
     ok(capsys, "report", run, "--appendix")
     kinds = {"1": "deflection", "2": "absolute", "3": "deflection"}
-    seen = []
+    all_kinds = []
     for heads, rows in tables(run.with_suffix(".html").read_text(encoding="utf-8")):
         if "left out" in heads or "poses left out" in heads:
-            own = {kinds[row[0].removeprefix("→ ")] for row in rows}
-            assert len(own) == 1, (heads, rows)
-            seen.append(own.pop())
-    assert sorted(seen) == ["absolute", "deflection", "deflection"]  # the story, then the file
+            kinds_of_table = {kinds[row[0].removeprefix("→ ")] for row in rows}
+            assert len(kinds_of_table) == 1, (heads, rows)
+            all_kinds.append(kinds_of_table.pop())
+    assert sorted(all_kinds) == ["absolute", "deflection", "deflection"]  # the story, then the file
 
 
 def tables(page):

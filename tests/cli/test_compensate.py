@@ -137,8 +137,8 @@ def test_waypoints_are_corrected_left_or_refused_and_that_is_said(capsys, fitted
     assert "p.script: line 5: the waypoint 'w' is computed" in said
     assert "--leave" in said
     assert not out.exists()
-    told = ok(capsys, "compensate", fitted, program, "-o", out, "--leave", "--json")
-    fates = told.document["waypoints"]
+    result = ok(capsys, "compensate", fitted, program, "-o", out, "--leave", "--json")
+    fates = result.document["waypoints"]
     assert [(f["line"], f["done"]) for f in fates] == [
         (2, "corrected"),
         (5, "left"),
@@ -147,13 +147,13 @@ def test_waypoints_are_corrected_left_or_refused_and_that_is_said(capsys, fitted
     assert fates[0]["blend_m"] == 0.02
     assert "'w' has its value from lines 3, 4" in fates[1]["why"]
     assert "measured" in fates[2]["why"]
-    assert "beyond" not in told.err
-    assert len(told.document["points"]) == 1
+    assert "beyond" not in result.err
+    assert len(result.document["points"]) == 1
     now = out.read_bytes().decode().split("\r\n")
     kept = [a == b for a, b in zip(lines, now[:-1], strict=True)]
     assert kept == [True, False, True, True, True, True]
     (q,) = [w.q for w in waypoints(now[1] + "\n")]
-    np.testing.assert_allclose(q, told.document["points"][0]["q_corrected"], atol=1e-9)
+    np.testing.assert_allclose(q, result.document["points"][0]["q_corrected"], atol=1e-9)
     shown = ok(capsys, "compensate", fitted, program, "--leave").out
     assert "passes its place within 20" in " ".join(shown.split())
     assert "--leave is for" in refused(
@@ -175,8 +175,8 @@ def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp
     assert "\n'=1+1," in (tmp_path / "a.csv").read_text()
     kept = [line.rsplit(",", 3)[0] for line in (tmp_path / "a.csv").read_text().splitlines()]
     points.write_text("\n".join(kept) + "\n")
-    told = ok(capsys, "compensate", fitted, points, "--json").document
-    assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
+    document = ok(capsys, "compensate", fitted, points, "--json").document
+    assert [point["name"] for point in document["points"]] == ["w0", "=1+1", "w2"]
 
 
 def test_what_may_be_another_motion_than_meant_is_said(capsys, fitted, tmp_path):
@@ -314,10 +314,12 @@ def test_a_load_as_the_force_sensor_reads_it_is_the_load(capsys, fitted, tmp_pat
 
 def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, tmp_path):
     """A pose in the base that is handed over, corrected, is where the simulated tracker has it."""
-    told = tmp_path / "frames.json"
-    exported = ok(capsys, "export", fitted, "--frames", told, "--urdf", tmp_path / "a.urdf").out
+    frames_file = tmp_path / "frames.json"
+    exported = ok(
+        capsys, "export", fitted, "--frames", frames_file, "--urdf", tmp_path / "a.urdf"
+    ).out
     shown = next(line for line in exported.splitlines() if line.startswith("The robot's base: at"))
-    frames = json.loads(told.read_text())
+    frames = json.loads(frames_file.read_text())
     base, tool = (of_six(frames[k]) for k in ("base_in_tracker", "tool_on_flange"))
     assert frames["controller"]["base_in_tracker_m_rad"] == frames["base_in_tracker"]
     world = rehearsal("nothing").world

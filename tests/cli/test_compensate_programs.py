@@ -51,8 +51,8 @@ def lab(tmp_path_factory):
         np.radians([60, -30, 120, 60, 80, 170]),
     )
     q = low + rng.random((POSES, 6)) * (high - low)
-    seen = SEEN @ flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
-    at = seen[:, :3, 3] + 1e-5 * rng.standard_normal((POSES, 3))
+    target_poses = SEEN @ flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
+    at = target_poses[:, :3, 3] + 1e-5 * rng.standard_normal((POSES, 3))
     lines = ["Punkt;A1;A2;A3;A4;A5;A6;X [mm];Y [mm];Z [mm]"]
     for k in range(POSES):
         numbers = [f"{v:.5f}" for v in (*np.degrees(q[k]), *(1e3 * at[k]))]
@@ -75,18 +75,20 @@ def test_the_guide_leads_from_a_table_to_corrected_krl_points(lab, capsys, monke
     without = [word for word in last if word not in ("--frames", "config.dat")]
     assert "TOOL_DATA[1] is not in the program; give it by --frames" in refused(capsys, 2, *without)
     assert not list(Path("corrected").iterdir())
-    told = ok(capsys, *last, "--json").document
-    assert [w["done"] for w in told["waypoints"]] == ["corrected"] * 7
-    assert sorted(told["written"]) == ["corrected/weld.dat", "corrected/weld.src"]
+    document = ok(capsys, *last, "--json").document
+    assert [w["done"] for w in document["waypoints"]] == ["corrected"] * 7
+    assert sorted(document["written"]) == ["corrected/weld.dat", "corrected/weld.src"]
     assert sorted(p.name for p in Path("corrected").iterdir()) == ["weld.dat", "weld.src"]
     assert "--force" in refused(capsys, 2, *last)
     base, tool = pose([800, -200, 150, 30, 0, 0]), pose([120.5, -3.2, 210, 10, 20, -30])
     before, after = points(Path("weld.dat")), points(Path("corrected/weld.dat"))
-    to_base = se3.inverse(of_six(told["base_in_tracker"])) @ SEEN
+    to_base = se3.inverse(of_six(document["base_in_tracker"])) @ SEEN
     errors = []
     for name, frame in (("XP1", base), ("XP2", base), ("XP3", np.eye(4))):
         asked, commanded = frame @ before[name], frame @ after[name]
-        near = next(np.array(p["q_command"]) for p in told["points"] if p["name"].startswith(name))
+        near = next(
+            np.array(p["q_command"]) for p in document["points"] if p["name"].startswith(name)
+        )
         reached = [
             to_base @ flanges(true, solutions(nominal, tool, near[None], goal))[0] @ tool
             for goal in (asked, commanded)
@@ -94,7 +96,7 @@ def test_the_guide_leads_from_a_table_to_corrected_krl_points(lab, capsys, monke
         errors.append([np.linalg.norm((r - asked)[:3, 3]) for r in reached])
     was, now = np.array(errors).T
     assert was.min() > 3e-4
-    assert np.all(now < [p["band_m"] for p in told["points"][:3]])
+    assert np.all(now < [p["band_m"] for p in document["points"][:3]])
     assert now.max() < 0.1 * was.min()
     text = Path("corrected/weld.src").read_bytes().decode("latin-1")
     assert "; geprüft:" in text
@@ -104,7 +106,7 @@ def test_the_guide_leads_from_a_table_to_corrected_krl_points(lab, capsys, monke
 def test_into_the_labs_own_urdf(lab, capsys):
     """The same table: the URDF that the cell names, corrected, is the arm that was measured."""
     folder, _, true = lab
-    run, mine, cell = folder / "into.hilcal", folder / "mine.urdf", folder / "BASE.toml"
+    run, user_file, cell = folder / "into.hilcal", folder / "mine.urdf", folder / "BASE.toml"
     stated = (
         'frame = "tracker"\nbase_xyz_m = [2.4, -1.6, -0.5]\nbase_rotvec_rad = [0.02, -0.03, 2.1]'
     )
@@ -116,21 +118,26 @@ def test_into_the_labs_own_urdf(lab, capsys):
     ok(capsys, "import", folder / "faro.csv", *more)
     ok(capsys, "identify", run, "--effects", "link_geometry")
     text = f"<!-- bay 3 -->{(folder / 'kuka.urdf').read_text()}"
-    mine.write_text(text)
-    assert "mine.urdf: the file exists" in refused(capsys, 2, "export", run, "--into", mine)
-    assert mine.read_text() == text
-    shown = ok(capsys, "export", run, "--into", mine, "--matlab", folder / "arm.m", "--force").out
+    user_file.write_text(text)
+    assert "mine.urdf: the file exists" in refused(capsys, 2, "export", run, "--into", user_file)
+    assert user_file.read_text() == text
+    shown = ok(
+        capsys, "export", run, "--into", user_file, "--matlab", folder / "arm.m", "--force"
+    ).out
     assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in " ".join(shown.split())
-    assert mine.read_text().startswith("<!-- bay 3 -->")
+    assert user_file.read_text().startswith("<!-- bay 3 -->")
     assert (folder / "arm.m").read_text().startswith("function robot = arm()")
     q = np.radians([[10, -70, 100, 20, -60, 30], [-20, -80, 110, 15, 50, 160]])
-    made = flanges(arm_from_urdf(mine), q) @ se3.matrix(np.eye(3), TOOL)
+    made = flanges(arm_from_urdf(user_file), q) @ se3.matrix(np.eye(3), TOOL)
     there = flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
     assert np.linalg.norm((made - there)[:, :3, 3], axis=1).max() < 6e-5
     for given, words in (
         (("--urdf", folder / "n.urdf", "--tip-link", "x"), "--tip-link needs --into"),
         (("--into", folder / "no.urdf"), "no.urdf: no such file; valid: a URDF"),
-        (("--into", mine, "--force", "--tip-link", "x"), "link 'x' is there 0 times; valid: base"),
+        (
+            ("--into", user_file, "--force", "--tip-link", "x"),
+            "link 'x' is there 0 times; valid: base",
+        ),
         (("--matlab", folder / "1.m"), "valid: a name that MATLAB calls"),
     ):
         assert words in refused(capsys, 2, "export", run, *given)

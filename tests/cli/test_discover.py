@@ -109,13 +109,15 @@ def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monk
     assert found.document["laws"][0]["formula"] == "dq_2 = a"
     assert [kind.name for kind in read_effects(out).effects] == ["bent"]
     # the commands that are told work in the searched revision, and know its own effects
-    mine = tmp_path / "mine.py"
-    mine.write_text(source_of_form(hardly, "mine", law.parameters), encoding="utf-8")
-    known = ("--effects-from", mine)
+    user_file = tmp_path / "mine.py"
+    user_file.write_text(source_of_form(hardly, "mine", law.parameters), encoding="utf-8")
+    known = ("--effects-from", user_file)
     ok(capsys, "identify", creeping, "--effects", "joint_compliance, mine", *known)
     found = ok(capsys, "discover", creeping, "-o", out, "--revision", "2", *known, "--json")
-    told = f"hilcal add {creeping} bent --revision 2 --effects-from {mine} --effects-from {out}"
-    assert told in " ".join(found.err.split())
+    expected_text = (
+        f"hilcal add {creeping} bent --revision 2 --effects-from {user_file} --effects-from {out}"
+    )
+    assert expected_text in " ".join(found.err.split())
 
 
 def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path, capsys):
@@ -126,28 +128,28 @@ def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path
     hose = tmp_path / "hose.py"
     named = law.replace('name = "found"', 'name = "forearm_hose"').replace("Found", "ForearmHose")
     hose.write_text(named, encoding="utf-8")
-    own = ("--effects-from", hose)
-    listed = ok(capsys, "effects", *own, "--json").document
+    with_law = ("--effects-from", hose)
+    listed = ok(capsys, "effects", *with_law, "--json").document
     assert "forearm_hose" in str(listed)
     model = ("--effects", "joint_compliance, forearm_hose")
-    fitted = ok(capsys, "identify", run_file, *model, *own, "--json").document
+    fitted = ok(capsys, "identify", run_file, *model, *with_law, "--json").document
     assert "forearm_hose" in str(fitted["model"])
-    judged = ok(capsys, "diagnose", run_file, *own, "--json").document
+    judged = ok(capsys, "diagnose", run_file, *with_law, "--json").document
     assert judged["model"][-1] == "forearm_hose"
     assert "forearm_hose" in run(capsys, "diagnose", run_file).err  # refused by name
     other = stored_readings(tmp_path / "other.hilcal", rehearsal("nothing", 5, 6).readings)
-    validated = ok(capsys, "validate", run_file, other, *own, "--json")
+    validated = ok(capsys, "validate", run_file, other, *with_law, "--json")
     assert validated.document
     calibration = tmp_path / "cal.json"
-    ok(capsys, "export", run_file, "--calibration", calibration, *own)
+    ok(capsys, "export", run_file, "--calibration", calibration, *with_law)
     points = tmp_path / "points.csv"
     with CampaignFile.open(run_file) as file:
         near = np.degrees(file.readings().states.q[:1] + 0.01)
     rows = "\n".join(",".join(f"{x:.6f}" for x in row) for row in near)
     points.write_text(f"q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n{rows}\n", encoding="utf-8")
     use = ("--load", "10kg", "--allow-outside", "--json")
-    by_run = ok(capsys, "compensate", run_file, points, *use, *own).document
-    by_file = ok(capsys, "compensate", calibration, points, *use, *own).document
+    by_run = ok(capsys, "compensate", run_file, points, *use, *with_law).document
+    by_file = ok(capsys, "compensate", calibration, points, *use, *with_law).document
     assert by_run["points"][0]["q_rad"] == pytest.approx(by_file["points"][0]["q_rad"], abs=1e-9)
     assert "forearm_hose" in run(capsys, "compensate", calibration, points, *use).err
 

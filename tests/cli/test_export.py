@@ -41,11 +41,11 @@ def test_a_campaign_imports_what_another_exported(capsys, tmp_path, kind, covers
     first = stored_readings(tmp_path / "a.hilcal", rounded, covers=covers)
     table, cell, again = tmp_path / f"r.{kind}", tmp_path / "CELL.toml", tmp_path / "b.hilcal"
     ok(capsys, "export", first, "--readings", table, "--cell", cell)
-    told = ok(capsys, "import", table, "--config", cell, "-o", again, "--json").document
+    document = ok(capsys, "import", table, "--config", cell, "-o", again, "--json").document
     with hc.Campaign.open(first) as a, hc.Campaign.open(again) as b:
         assert a.file.data_hash() == b.file.data_hash()
         assert content_hash(a.readings) == content_hash(b.readings)
-        assert a.covariance_parts == b.covariance_parts == told["covariance"]
+        assert a.covariance_parts == b.covariance_parts == document["covariance"]
         assert a.config.robot == b.config.robot
         assert a.config.to_json() == b.config.to_json()
 

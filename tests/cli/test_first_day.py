@@ -128,10 +128,10 @@ class Day:
             r = run.readings
         if load is None:
             return r.states
-        mine = r.states[r.load == r.load_names.index(load)]
-        order = np.lexsort(mine.q.T[::-1])
-        q = mine.q[order]
-        return replace(mine[order][:-1], q=0.85 * q[:-1] + 0.15 * q[1:])
+        under_load = r.states[r.load == r.load_names.index(load)]
+        order = np.lexsort(under_load.q.T[::-1])
+        q = under_load.q[order]
+        return replace(under_load[order][:-1], q=0.85 * q[:-1] + 0.15 * q[1:])
 
 
 @pytest.fixture(scope="module")
@@ -227,8 +227,8 @@ def test_the_report_passes_what_the_truth_passes(day):
     page = html.unescape(re.sub(r"<[^>]+>", " ", (day.home / "report.html").read_text("utf-8")))
     page = " ".join(page.split())
     assert said.number(r"PASSED: (\d+) of \d+ errors") == len(day.states())
-    told = re.search(r"expanded uncertainty U = ([\d.]+) (µm|mm) \(3-D, k = 2\)", page)
-    U = float(told[1]) * {"µm": 1e-6, "mm": 1e-3}[told[2]]
+    match = re.search(r"expanded uncertainty U = ([\d.]+) (µm|mm) \(3-D, k = 2\)", page)
+    U = float(match[1]) * {"µm": 1e-6, "mm": 1e-3}[match[2]]
     states, c = day.states(), day.calibration()
     predicted = c.predict(states.q, states.wrench).position
     off = np.linalg.norm(predicted - seen(day.secret.world, states, c.base_in_tracker()), axis=1)
@@ -273,8 +273,8 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     said = day.at("export", RUN, *words.split(), "--calibration", "arm.json")
     assert "Not included, as not constant: joint_compliance" in said.text
     assert the_same_base(said.text) == the_same_base(day.said["refine"].text)
-    told = json.loads((day.home / "frames.json").read_text())
-    base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])
+    document = json.loads((day.home / "frames.json").read_text())
+    base, tool = pose(document["base_in_tracker"]), pose(document["tool_on_flange"])
     the_base_is_true(day, said)
     states, c = day.states("10kg"), hc.Calibration.load(day.home / "arm.json")
     states = replace(states, wrench=0 * states.wrench)
@@ -286,7 +286,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     exported = {
         "URDF": by_pinocchio(urdf_model(urdf), states.q) @ tool,
         "DH": flanges(load_arm(str(day.home / "a.toml")), states.q) @ tool,
-        "UR": by_ur(ur, states.q) @ pose(told["tcp_for_ur_kinematics"]),
+        "UR": by_ur(ur, states.q) @ pose(document["tcp_for_ur_kinematics"]),
     }
     nominal = flanges(c.model.cell.arm, states.q) @ tool
     for name, poses in exported.items():
@@ -295,7 +295,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
         assert off.mean() < 0.1 * np.linalg.norm(nominal[:, :3, 3] - wanted, axis=1).mean(), name
     predicted = np.linalg.norm(found.position - seen(world, states, base), axis=1)
     assert np.mean(predicted <= found.band_m) > 0.9
-    controller = told["controller"]
+    controller = document["controller"]
     there = inverse(of_six(controller["tracker_in_base_m_rad"]))
     np.testing.assert_allclose(there, base, atol=1e-9)
     np.testing.assert_allclose(c.base_in_tracker(), base, atol=1e-9)
@@ -312,10 +312,10 @@ def test_the_table_of_a_colleague_tells_the_same(day):
     text = table_of(head, names, loads, np.degrees(r.states.q), 1e3 * r.value, ["ok"] * len(r),
                     comma=True)  # fmt: skip
     write(day.home / "theirs.csv", text, "cp1252")
-    own = ("import", "theirs.csv", "--config", "CELL.toml")
-    previewed = day.at(*own, "--preview", "-o", "mapping.toml")
+    command = ("import", "theirs.csv", "--config", "CELL.toml")
+    previewed = day.at(*command, "--preview", "-o", "mapping.toml")
     assert "import with --format mapping.toml" in previewed.text
-    said = day.at(*own, "--format", "mapping.toml", "-o", "theirs.hilcal")
+    said = day.at(*command, "--format", "mapping.toml", "-o", "theirs.hilcal")
     assert "load 10kg: its force is that of [[loads]]" in said.text
     refined = day.at("refine", "theirs.hilcal")
     with hc.Campaign.open(day.home / "theirs.hilcal", read_only=True) as run:

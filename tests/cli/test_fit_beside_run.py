@@ -189,14 +189,14 @@ def test_a_bad_revision_is_set_aside_and_no_reading(run, found, capsys, how):
     for command in ("info", "identify", "compare", "export"):
         words = ["--readings", str(run.with_suffix(".csv"))] if command == "export" else []
         assert f"hilcal repair {run}" in refused(capsys, 2, command, run, *words)
-    told = refused(capsys, 2, "run", CELL, "-o", run, "--resume")  # it looks at no revision
-    assert "was not measured with `hilcal run`" in told
+    refusal_text = refused(capsys, 2, "run", CELL, "-o", run, "--resume")  # it looks at no revision
+    assert "was not measured with `hilcal run`" in refusal_text
     with CampaignFile.open(run, check_revisions=False) as file:
         readings = file.readings()
         more_hash = content_hash(readings)
-    told = ok(capsys, "repair", run, "--json").document
-    assert told["set_aside"] == [2, 3]
-    beside = Path(told["original"])
+    refusal_text = ok(capsys, "repair", run, "--json").document
+    assert refusal_text["set_aside"] == [2, 3]
+    beside = Path(refusal_text["original"])
     assert beside.read_bytes() == original
     assert beside.parent == run.parent
     with CampaignFile.open(run) as file:

@@ -35,16 +35,16 @@ def words(text):
 def test_help_breaks_and_cuts_no_word_at_any_width(
     command: tuple[str, ...], capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = {}
+    by_width = {}
     for width in (60, 80, 120):
         monkeypatch.setenv("COLUMNS", str(width))
         text = ok(capsys, *command, "-h").out
         assert max(map(len, text.splitlines())) <= width
-        told[width] = words(text)
-    assert told[60] == told[80] == told[120]
-    assert "-o" not in told[80]  # without its long name, after a comma
-    assert not [word for word in told[80] if word.endswith("...")]
-    assert "130 interrupted with Ctrl-C" in " ".join(told[80]) or len(command) == 2
+        by_width[width] = words(text)
+    assert by_width[60] == by_width[80] == by_width[120]
+    assert "-o" not in by_width[80]  # without its long name, after a comma
+    assert not [word for word in by_width[80] if word.endswith("...")]
+    assert "130 interrupted with Ctrl-C" in " ".join(by_width[80]) or len(command) == 2
 
 
 def test_the_list_of_commands_is_in_the_order_of_the_work(capsys):
@@ -56,8 +56,8 @@ def test_the_list_of_commands_is_in_the_order_of_the_work(capsys):
     assert at == sorted(at)
     shown = [line.split()[0] for line in text[at[0] :].splitlines() if line[2:3].isalpha()]
     assert [name for name in shown if name in COMMANDS] == [n for n in listed if n in COMMANDS]
-    told = " ".join(text.split())
-    assert all(command.summary in told for command in COMMANDS.values())
+    printed = " ".join(text.split())
+    assert all(command.summary in printed for command in COMMANDS.values())
 
 
 def test_a_shell_completes_commands_and_options(capsys, monkeypatch):

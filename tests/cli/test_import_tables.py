@@ -449,14 +449,16 @@ def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(tmp_path, cap
     text = lines(["Point", *NAMES, "X", "Y", "Z"], [f"P{k}" for k in range(12)], np.rad2deg(C.q),
                  position)  # fmt: skip
     path, mapping = write(tmp_path / "t.csv", text), tmp_path / "m.toml"
-    own = MAPPING.split("[std]")[0]
+    positions_only = MAPPING.split("[std]")[0]
     arguments = ("import", path, "--config", CELL, "-o", tmp_path / "r.hilcal", "--format", mapping)
-    mapping.write_text(own, encoding="utf-8")
+    mapping.write_text(positions_only, encoding="utf-8")
     said = refused(capsys, 2, *arguments)
     assert "row 7" in said
     assert "name them as missing in a mapping" in said
     assert "millimetres" not in said
-    mapping.write_text(own.replace("[file]", "[file]\nmissing = [-9999]"), encoding="utf-8")
+    mapping.write_text(
+        positions_only.replace("[file]", "[file]\nmissing = [-9999]"), encoding="utf-8"
+    )
     assert ok(capsys, *arguments, "--json").document["n_readings"] == 11
 
 

@@ -222,8 +222,8 @@ def sent(tmp_path):
 
 def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file(sent, capsys):
     path, _ = sent
-    told = json.loads(ok(capsys, "identify", path, "--json").out)
-    found = {p["name"]: p["value"] for p in told["parameters"]}
+    document = json.loads(ok(capsys, "identify", path, "--json").out)
+    found = {p["name"]: p["value"] for p in document["parameters"]}
     fitted = simulated()
     for e in fitted.parameters:
         if e.name.startswith("joint_compliance") and e.value is not None:

@@ -58,12 +58,12 @@ def test_comments_and_examples_are_those_of_the_configuration(options, tmp_path,
 def test_what_a_cell_still_lacks_is_all_that_check_asks_for(options, tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     said = " ".join(ok(capsys, "init", path, "--robot", "ur5e", *options).out.split())
-    told = re.search(r", once it has (.*?):", said)
+    match = re.search(r", once it has (.*?):", said)
     cell, answers = tomllib.loads(path.read_text("utf-8")), ("ur", "127.0.0.1", "geocom", "/no")
     keys = ("[robot] driver", "[robot] host", "[tracker] driver", "[tracker] port")
     for words, answer in zip(keys, answers, strict=True):
         section, key = words.strip("[").split("] ")
-        if words in told[1]:
+        if words in match[1]:
             assert key not in cell.get(section, {})
             path.write_text(tomli_w.dumps(cell), "utf-8")
             assert run(capsys, "check", path).code == 2

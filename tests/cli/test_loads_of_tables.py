@@ -23,13 +23,13 @@ def test_a_load_without_force_takes_that_of_the_cell_or_is_told_apart(name, tmp_
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    told = " ".join(ok(capsys, "import", table, "--config", CELL, "-o", run).out.split())
+    printed = " ".join(ok(capsys, "import", table, "--config", CELL, "-o", run).out.split())
     fitted = " ".join(ok(capsys, "identify", run).out.split())
     if name == "5kg":  # of the cell's [[loads]]
-        assert "load 5kg: its force is that of [[loads]] of the cell" in told
+        assert "load 5kg: its force is that of [[loads]] of the cell" in printed
         with CampaignFile.open(run) as campaign:
             assert campaign.readings().states.wrench == pytest.approx(readings.states.wrench)
         assert "gross" not in fitted
     else:
-        assert "load 7 kg: its force is not stated by the table" in told
+        assert "load 7 kg: its force is not stated by the table" in printed
         assert "All 14 readings under the load 7 kg are set aside: check its force." in fitted

@@ -173,8 +173,8 @@ def test_the_demo_settles_a_doubt(tmp_path, capsys):
     assert [r.added for r in records] == [None, None, LINK]
     assert records[0].data_hash != records[1].data_hash
     assert d["doubt"]["verdict"] == records[0].result_json["diagnose"]["verdict"]
-    told = re.search(r"(\d+) readings were added. All (\d+)", result.err)
-    assert 0 < int(told[1]) < int(told[2]) == len(readings)
+    match = re.search(r"(\d+) readings were added. All (\d+)", result.err)
+    assert 0 < int(match[1]) < int(match[2]) == len(readings)
     viewed = ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json").document
     assert viewed["revisions"] == [2, 3]
 
@@ -320,11 +320,11 @@ def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     path, further = site.directory / "run.hilcal", str(further_plan(site))
     config = load_config(site.directory / "cell.toml")
     create_run(path, config, site.directory, site.plan).close()
-    told = ok(capsys, *site.command("--append", "--plan", further, "--json"))
+    result = ok(capsys, *site.command("--append", "--plan", further, "--json"))
     missing = f"{len(site.plan.steps)} readings of the previous plan are missing"
-    assert missing in " ".join(told.err.split())
+    assert missing in " ".join(result.err.split())
     moved = 'its pose "reference" is up to 0.02 rad from that of the campaign'
-    assert moved in " ".join(told.err.split())
+    assert moved in " ".join(result.err.split())
     assert "previous plan" not in ok(capsys, *site.command("--resume", "--json")).err
 
 

@@ -74,8 +74,8 @@ def test_nothing_to_carry_over(run, tmp_path, capsys):
     said = refused(capsys, 4, "identify", later, "--prior", run)
     assert "run hilcal refine first" in said
     ok(capsys, "refine", run)
-    told = ok(capsys, "identify", later, "--prior", run)
-    assert "nothing to carry over" not in told.err
+    result = ok(capsys, "identify", later, "--prior", run)
+    assert "nothing to carry over" not in result.err
     ok(capsys, "identify", later, "--prior", run, "--drift", "joint_compliance=1")
 
 

@@ -99,10 +99,10 @@ def test_every_command_in_order(tmp_path, monkeypatch, capsys):
         shown[" ".join(words)] = result
         if words[0] == "plan" and not Path("other.hilcal").exists():
             draw(config, ["run", "CELL.toml", "--plan", words[3], "-o", "other.hilcal"], 7)
-    told = said(shown, "plan CELL.toml -o plan.json")
-    assert "joint_compliance.j1: not determined" in told
-    assert "joint 1 needs a side pull" in told
-    assert "it is not the accuracy of the robot" in told
+    printed = said(shown, "plan CELL.toml -o plan.json")
+    assert "joint_compliance.j1: not determined" in printed
+    assert "joint 1 needs a side pull" in printed
+    assert "it is not the accuracy of the robot" in printed
     assert "joint_compliance.j1" in said(shown, "identify run.hilcal")
     assert "adequate" in said(shown, "refine run.hilcal")
     assert "2 points compensated" in said(shown, "compensate run.hilcal")

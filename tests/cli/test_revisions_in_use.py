@@ -117,8 +117,8 @@ def test_every_command_that_reads_a_model_takes_a_revision(run, tmp_path, capsys
     assert (d["revision"], d["model"]) == (2, two)
     recording = tmp_path / "s.rrd"
     story = ("view", run, "--record", recording, "--json")
-    assert (told := ok(capsys, *story)).document["revisions"] == [3]
-    assert f"open it with: {open_command(recording)}" in told.err
+    assert (result := ok(capsys, *story)).document["revisions"] == [3]
+    assert f"open it with: {open_command(recording)}" in result.err
     assert ok(capsys, *story, "--revision", "2").document["revisions"] == [1, 2]
     parameters = tmp_path / "p.csv"
     ok(capsys, "export", run, "--parameters", parameters, "--revision", "2")

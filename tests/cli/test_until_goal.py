@@ -79,47 +79,47 @@ def test_the_position_is_as_sure_as_it_says():
     clean, rng = noiseless(c.world, p), np.random.default_rng(3)
     work = plan(3, 7).states.q[::5]
     states = nominal_states(work, np.zeros((len(work), 6)))
-    told = rule("position std < 1 um", c, readings="absolute", work_q_rad=work.tolist())
-    stated, seen = [], []
+    stop_rule = rule("position std < 1 um", c, readings="absolute", work_q_rad=work.tolist())
+    stated, errors = [], []
     for k in range(40):
         readings = with_noise(clean, rng)
         if k % 5 == 0:
-            stated.append(told(readings, last=False).std)
+            stated.append(stop_rule(readings, last=False).std)
         model = baseline(c.cell, readings, "absolute")
         found = fit(model, readings, "absolute")
-        seen.append(model.predict(states, found.theta).observation.position)
-    scatter = np.sqrt(np.mean(np.sum(np.var(seen, axis=0, ddof=1), axis=1)))
+        errors.append(model.predict(states, found.theta).observation.position)
+    scatter = np.sqrt(np.mean(np.sum(np.var(errors, axis=0, ddof=1), axis=1)))
     assert np.median(stated) == pytest.approx(scatter, rel=0.2)
-    assert status_words(told.status).startswith("predicted position ± ")
+    assert status_words(stop_rule.status).startswith("predicted position ± ")
     where = "of the predicted position at 3 named poses"
-    assert full_words(told.status).startswith(f"standard uncertainty (rms) {where}: ")
+    assert full_words(stop_rule.status).startswith(f"standard uncertainty (rms) {where}: ")
 
 
 def test_what_is_not_determined_yet_is_not_met():
     c = campaign(mode="deflection", poses=8)
     free = c.readings[c.readings.unloaded]
-    told = rule("joint std < 1000 %", c)
+    stop_rule = rule("joint std < 1000 %", c)
     for readings in (free[:1], free[:2], free, c.readings[:3]):
-        status = told(readings, last=False)
+        status = stop_rule(readings, last=False)
         assert not status.met
         assert status.std in (None, np.inf)
         assert status_words(status) in ("", "joint std not determined yet (j1)")
-    assert told(c.readings, last=False).met
+    assert stop_rule(c.readings, last=False).met
 
 
 def test_no_deflection_is_predicted_before_the_loads_are_read():
     """Unloaded readings say nothing of it, and a load at one pose not enough."""
     c = campaign(mode="deflection", poses=8)
     work = plan(3, 7).states.q[::5].tolist()
-    told = rule("deflection std < 20 um", c, work_q_rad=work)
+    stop_rule = rule("deflection std < 20 um", c, work_q_rad=work)
     free = c.readings.unloaded
     one = (c.readings.pose == 0) & (c.readings.load <= 1)
     for some in (free, free | one, one):
-        status = told(c.readings[some], last=True)
+        status = stop_rule(c.readings[some], last=True)
         assert not status.met
         assert status.std in (None, np.inf)
         assert status_words(status) in ("", "predicted deflection not determined yet")
-    status = told(c.readings, last=True)
+    status = stop_rule(c.readings, last=True)
     assert status.met
     assert status.std is not None
     assert 0.1e-6 < status.std < 20e-6
@@ -144,8 +144,8 @@ def test_an_estimated_uncertainty_must_do_twice():
     c = campaign("joint_tilt_compliance", mode="deflection", poses=10, strength=3.0)
     found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
     assert found.uncertainty.inflated
-    told = rule("j2 std < 500 %", c)
-    assert [told(c.readings, last=False).met for _ in range(2)] == [False, True]
+    stop_rule = rule("j2 std < 500 %", c)
+    assert [stop_rule(c.readings, last=False).met for _ in range(2)] == [False, True]
     assert rule("j2 std < 500 %", c)(c.readings, last=True).met
 
 
@@ -164,24 +164,24 @@ def test_fits_take_a_tenth_of_the_time(monkeypatch):
         return real(*arguments)
 
     monkeypatch.setattr(goal_rule, "fit", slow)
-    told = GoalRule("joint std < 1 %", c.cell.with_config(config_of()), now=lambda: at[0])
+    stop_rule = GoalRule("joint std < 1 %", c.cell.with_config(config_of()), now=lambda: at[0])
     order = np.argsort(~c.readings.unloaded, kind="stable")
     readings = c.readings[order]
     for count in range(9, len(readings) + 1):
         at[0] += 1.0
-        told(readings[:count], last=count == len(readings))
+        stop_rule(readings[:count], last=count == len(readings))
     assert fitted == [9, 29, 40]
 
 
 def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch):
     c = campaign(mode="deflection", poses=8)
-    told = rule("joint std < 1 %", c)
+    stop_rule = rule("joint std < 1 %", c)
     loaded = c.readings[c.readings.pose < 7]
-    told(loaded, last=False)
+    stop_rule(loaded, last=False)
     monkeypatch.setattr(goal_rule, "fit", None)  # not called
     more = c.readings[(c.readings.pose < 7) | c.readings.unloaded]
     order = np.argsort((more.pose == 7) & more.unloaded, kind="stable")
-    assert told(more[order], last=False).std > 0
+    assert stop_rule(more[order], last=False).std > 0
 
 
 # the command

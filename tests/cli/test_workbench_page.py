@@ -99,8 +99,8 @@ def workbench(folder, browser=False, *given):
     options = () if browser else ("--no-browser",)
     process = start("workbench", *begun, *options, "--port", "0", "--json", cwd=folder)
     try:
-        told = json.loads("".join(iter(process.stdout.readline, "}\n")) + "}")
-        yield Served(folder / told["run"], told["url"], process)
+        document = json.loads("".join(iter(process.stdout.readline, "}\n")) + "}")
+        yield Served(folder / document["run"], document["url"], process)
     finally:
         process.kill()
         process.communicate()
@@ -197,10 +197,10 @@ async def nothing(scope, receive, send):
 
 def asked(guard, path, method="GET", **heads):
     """The status of an answer."""
-    told: list[Message] = []
+    messages: list[Message] = []
 
     async def send(message):
-        told.append(message)
+        messages.append(message)
 
     async def receive():
         raise AssertionError
@@ -212,7 +212,7 @@ def asked(guard, path, method="GET", **heads):
         "headers": [(name.encode(), value.encode()) for name, value in given.items()],
     }  # fmt: skip
     asyncio.run(guard(scope, receive, send))
-    return int(told[0]["status"])
+    return int(messages[0]["status"])
 
 
 def test_what_opens_the_page_is_of_its_user_alone(tmp_path, monkeypatch):
@@ -243,17 +243,17 @@ def waited_for(file):
 
 
 def test_a_socket_is_opened_by_its_own_page_alone(served):
-    own = {"Cookie": served.cookie, "Origin": f"http://127.0.0.1:{served.port}"}
-    assert served.handshake(**own) == 101
+    headers = {"Cookie": served.cookie, "Origin": f"http://127.0.0.1:{served.port}"}
+    assert served.handshake(**headers) == 101
     name = served.cookie.partition("=")[0]
     for heads in (
-        {**own, "Cookie": ""},
-        {**own, "Cookie": f"{name}=another"},
-        {**own, "Cookie": f"{name}={served.token}"},
-        {**own, "Origin": ""},
-        {**own, "Origin": "http://evil.example"},
-        {**own, "Origin": f"http://127.0.0.1:{served.port + 1}"},
-        {**own, "Host": f"evil.example:{served.port}"},
+        {**headers, "Cookie": ""},
+        {**headers, "Cookie": f"{name}=another"},
+        {**headers, "Cookie": f"{name}={served.token}"},
+        {**headers, "Origin": ""},
+        {**headers, "Origin": "http://evil.example"},
+        {**headers, "Origin": f"http://127.0.0.1:{served.port + 1}"},
+        {**headers, "Host": f"evil.example:{served.port}"},
     ):
         assert served.handshake(**heads) == 403, heads
     poll = SOCKET.replace("websocket", "polling")
@@ -283,8 +283,8 @@ def test_no_file_of_the_machine_is_served(served):
 
 
 def test_what_is_wrong_is_one_line(served, capsys, monkeypatch):
-    taken = ("workbench", served.run, "--no-browser", "--port", str(served.port))
-    assert "choose a free port" in refused(capsys, 2, *taken)
+    on_used_port = ("workbench", served.run, "--no-browser", "--port", str(served.port))
+    assert "choose a free port" in refused(capsys, 2, *on_used_port)
     monkeypatch.setitem(__import__("sys").modules, "nicegui", None)
     line = refused(capsys, 2, "workbench", served.run)
     assert line.endswith('pip install "hilcal[workbench]"')
@@ -324,10 +324,10 @@ def number(page, what):
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_the_page_fits_desktop_and_phone(browser, served, scheme):
-    told: list[str] = []
+    messages: list[str] = []
     with Campaign.open(served.run, read_only=True) as o:
         readings = int((o.file.readings().load > 0).sum())
-    page = opened(browser, served, told, viewport=DESKTOP, color_scheme=scheme)
+    page = opened(browser, served, messages, viewport=DESKTOP, color_scheme=scheme)
     for size in (DESKTOP, PHONE):
         page.set_viewport_size(size)  # type: ignore[arg-type]
         page.wait_for_timeout(300)
@@ -347,15 +347,15 @@ def test_the_page_fits_desktop_and_phone(browser, served, scheme):
     fill = shown.evaluate("e => getComputedStyle(e).fill")
     page.emulate_media(color_scheme="light" if scheme == "dark" else "dark")
     expect(shown).not_to_have_css("fill", fill)  # its text would be as light as the page
-    assert told == []
+    assert messages == []
 
 
 @pytest.mark.long
 @needs_chromium
 def test_an_operator_sees_adds_removes_and_goes_back(browser, served):
-    told: list[str] = []
+    messages: list[str] = []
     before = served.run.read_bytes()
-    page = opened(browser, served, told, viewport=DESKTOP)
+    page = opened(browser, served, messages, viewport=DESKTOP)
     expect(page.locator("[data-part=verdict]")).to_contain_text("Ambiguous")
     at_first = number(page, "error on poses left out")
     assert served.run.read_bytes() == before  # opening it wrote nothing
@@ -380,7 +380,7 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser, served):
     suspects.filter(has_text=BASE).click()
     page.get_by_text(f"The evidence for {BASE}").wait_for()
 
-    other = opened(browser, served, told, viewport=DESKTOP)  # a second tab
+    other = opened(browser, served, messages, viewport=DESKTOP)  # a second tab
     page.locator("[data-part=add]").dblclick()
     fell = page.get_by_text(f"With {BASE} the error on poses left out falls")
     fell.wait_for()
@@ -412,7 +412,7 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser, served):
     page.get_by_role("button", name="Read it again").click()
     page.get_by_text("Another command has changed the file").wait_for(state="hidden")
     assert number(page, "error on poses left out") == after
-    assert told == []
+    assert messages == []
 
 
 def field(page, name):
@@ -430,13 +430,13 @@ def came(page, place, how, words):
 @pytest.mark.long
 @needs_chromium
 def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
-    told: list[str] = []
+    messages: list[str] = []
     table, config = unstated(tmp_path / "t.csv"), tmp_path / "CELL.toml"
     replace_file(config, to_toml(SMALL).replace("[tracker]", "[tracker]\nrange_std_m = 5e-6"))
     before = table.read_bytes()
     with workbench(tmp_path, False, table, "--config", config) as served:
         assert served.run == tmp_path / "t.hilcal"
-        page = opened(browser, served, told, viewport=DESKTOP)
+        page = opened(browser, served, messages, viewport=DESKTOP)
         expect(page.get_by_text("from t.csv (table)")).to_be_visible()
         with Campaign.open(served.run, read_only=True) as o:
             stored_covariance = o.file.readings().covariance
@@ -488,7 +488,7 @@ def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
         page.locator("[data-revision='1']").get_by_role("button", name="Go back to it").click()
         came(page, "revisions", "done", "Revision 1 is shown, and every command uses it.")
         expect(field(page, "[tracker] transverse_std_m")).to_have_value("7.5e-06")
-    assert told == []
+    assert messages == []
     assert table.read_bytes() == before
     line = refused(capsys, 2, "workbench", table, "--config", config)
     assert "t.hilcal: the file exists and is not changed; open it with hilcal workbench" in line
@@ -506,9 +506,9 @@ def unstated(path):
 @needs_chromium
 @pytest.mark.slow
 def test_the_next_measurement_is_planned_and_the_arm_is_seen(browser, tmp_path):
-    told: list[str] = []
+    messages: list[str] = []
     with workbench(tmp_path) as served:
-        page = opened(browser, served, told, viewport=DESKTOP)
+        page = opened(browser, served, messages, viewport=DESKTOP)
         page.get_by_label("poses (as needed)").fill("8")
         page.get_by_role("button", name="Plan the next measurements").click()
         expect(page.locator("[data-part=planned]")).to_contain_text("readings at", timeout=WAIT)
@@ -519,7 +519,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(browser, tmp_path):
         frame.locator("canvas.visible").wait_for(state="attached")
         page.wait_for_timeout(8000)
         page.screenshot(path=tmp_path / "viewer.png", full_page=True)
-    assert told == []
+    assert messages == []
 
 
 @pytest.mark.long

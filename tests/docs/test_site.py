@@ -131,15 +131,15 @@ SHOWN = (
 @needs_chromium
 def test_a_browser_asks_nobody_else_and_has_nothing_to_complain_of(address: str) -> None:
     asked: list[str] = []
-    told: list[str] = []
+    messages: list[str] = []
     with open_browser() as browser:
         page = browser.new_page(viewport=DESKTOP)
         page.on("request", lambda r: asked.append(r.url))
-        page.on("console", lambda m: told.append(f"{m.type}: {m.text}"))
-        page.on("pageerror", lambda e: told.append(str(e)))
+        page.on("console", lambda m: messages.append(f"{m.type}: {m.text}"))
+        page.on("pageerror", lambda e: messages.append(str(e)))
         for name in SHOWN:
             page.goto(f"{address}/{name}", wait_until="networkidle")
-    assert told == []
+    assert messages == []
     assert [url for url in asked if not url.startswith((address, "data:"))] == []
 
 

@@ -392,12 +392,12 @@ def _force(name: str) -> Parser:
     def parse(data: bytes) -> bool:
         stream._deframer, stream._counter = fresh(form), sensor.losses()
         stream._count, stream._failure = 0, ""
-        at, seen = 1, []
+        at, forces = 1, []
         push = stream._deframer.push
 
         def noting(piece: bytes) -> list[bytes]:
             bodies = push(piece)
-            seen.extend(bodies)
+            forces.extend(bodies)
             return bodies
 
         stream._deframer.push = noting  # type: ignore[method-assign]
@@ -407,7 +407,7 @@ def _force(name: str) -> Parser:
             at += step
         if not data[0]:
             kept = {tuple(row) for row in stream._wrench[: min(stream._count, RING)].tolist()}
-            for body in seen:
+            for body in forces:
                 if body not in sound and wrench_of(body) in kept - measured:
                     whole = [framed(one) for one in sound] if name != "hex" else []
                     raise passed(f"{name}: a frame", framed(body), whole)

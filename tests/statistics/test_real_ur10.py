@@ -74,13 +74,13 @@ def halves(s: Series, names: tuple[str, ...], mine: np.ndarray) -> tuple[Fit, Fi
 def test_halves_of_a_series_agree_within_what_is_stated(how, names, ipa_ur10):
     s = series("B", ipa_ur10)
     row = np.arange(len(s.readings))
-    mine = row < len(row) // 2 if how == "first and second" else row % 2 == 0
-    a, b = halves(s, names, mine)
+    in_first_half = row < len(row) // 2 if how == "first and second" else row % 2 == 0
+    a, b = halves(s, names, in_first_half)
     rows = a.model.slices()[a.model.names.index("joint_compliance")]
-    seen = a.uncertainty.identifiable[rows] & b.uncertainty.identifiable[rows]
+    identifiable = a.uncertainty.identifiable[rows] & b.uncertainty.identifiable[rows]
     std = np.hypot(a.uncertainty.std[rows], b.uncertainty.std[rows])
-    z = ((a.theta - b.theta)[rows] / std)[seen]
-    assert seen.any()
+    z = ((a.theta - b.theta)[rows] / std)[identifiable]
+    assert identifiable.any()
     assert a.uncertainty.inflated
     assert np.abs(z).max() <= 3.5
 
@@ -93,11 +93,11 @@ def test_a_model_of_one_series_predicts_the_other(ipa_ur10):
     """
     c = series("C", ipa_ur10)
     plain = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute").error.mean_m
-    seen = {}
+    errors = {}
     for step in refined("B", ipa_ur10).steps:
         b = step.fit
         p = set_up_anew(predictive_of(b), b.readings, c.readings, "absolute")
         found = validate(p.model, p.theta, b.readings, c.readings, "absolute", registered=True)
-        seen[step.added] = found.error.mean_m
-    assert seen["link_geometry"] < 0.6 * plain
-    assert [*seen.values()][-1] < 0.8 * plain
+        errors[step.added] = found.error.mean_m
+    assert errors["link_geometry"] < 0.6 * plain
+    assert [*errors.values()][-1] < 0.8 * plain

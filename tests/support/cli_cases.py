@@ -54,9 +54,9 @@ def run(capsys, *arguments):
     )
     with pytest.raises(SystemExit) as ended:
         command([str(a) for a in given])
-    told = capsys.readouterr()
+    captured = capsys.readouterr()
     assert isinstance(ended.value.code, int)
-    return Outcome(ended.value.code, told.out, told.err)
+    return Outcome(ended.value.code, captured.out, captured.err)
 
 
 def ok(capsys, *arguments):

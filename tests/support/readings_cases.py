@@ -95,17 +95,17 @@ def readings_at(q, value, **more):
     `more` are fields of readings and of states, or `std` of every element for a covariance.
     """
     count, m = value.shape
-    told = {"wrench": np.zeros((count, 6))} | more
-    states = {name: told.pop(name) for name in States.__dataclass_fields__ if name in told}
-    pose = told.pop("pose", np.arange(count))
-    load = np.broadcast_to(told.pop("load", 0), count).astype(np.int64)
+    columns = {"wrench": np.zeros((count, 6))} | more
+    states = {name: columns.pop(name) for name in States.__dataclass_fields__ if name in columns}
+    pose = columns.pop("pose", np.arange(count))
+    load = np.broadcast_to(columns.pop("load", 0), count).astype(np.int64)
     usual = {
         "cycle": np.zeros(count, dtype=np.int64),
-        "covariance": np.tile(told.pop("std", 1e-5) ** 2 * np.eye(m), (count, 1, 1)),
+        "covariance": np.tile(columns.pop("std", 1e-5) ** 2 * np.eye(m), (count, 1, 1)),
         "load_names": ("none", *(f"load {k}" for k in range(1, load.max(initial=0) + 1))),
         "pose_names": tuple(f"p{k}" for k in range(pose.max(initial=-1) + 1)),
     }
-    return Readings(States(q, **states), pose=pose, load=load, value=value, **usual | told)
+    return Readings(States(q, **states), pose=pose, load=load, value=value, **usual | columns)
 
 
 def simple_readings(count, m=3, seed=0):

@@ -93,8 +93,8 @@ def children():
     """Child processes of the driver (the simulated controllers are children, too)."""
     end = time.monotonic() + 2.0
     while True:
-        mine = psutil.Process().children(recursive=True)
-        ours = [(p, " ".join(_words(p))) for p in mine]
+        processes = psutil.Process().children(recursive=True)
+        ours = [(p, " ".join(_words(p))) for p in processes]
         relays = sum("ur_link.relay" in words for _, words in ours)
         commands = sum("ur_link.children" in words and " control " in words for _, words in ours)
         if relays <= commands or time.monotonic() > end:

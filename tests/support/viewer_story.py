@@ -93,11 +93,11 @@ LOAD = DependenceCurve(
 
 def doubtful(names=""):
     """A story with doubts: a missing effect, an ambiguous one, an unknown one, and none left."""
-    told = story(poses=12, names=names)
-    first, second, third, last = told.revisions
+    campaign_story = story(poses=12, names=names)
+    first, second, third, last = campaign_story.revisions
     second = replace(second, verdict="ambiguous")
     third = replace(third, verdict="unknown_effect", dependence=ANGLE)
-    return replace(told, revisions=(first, second, third, last))
+    return replace(campaign_story, revisions=(first, second, third, last))
 
 
 def _revision(k, parts, truth, offset, covariance, torque, names):

@@ -206,17 +206,17 @@ def test_damage_on_the_line_lets_no_wrong_reading_through(kind, simulated):
         simulated.admin("flip", probability=0.02)
         simulated.admin("cut", probability=0.02)
         end = time.monotonic() + (3.0 if kind == "ft300" else 1.5)
-        seen = 0
+        readings_compared = 0
         while time.monotonic() < end:
             try:
                 sample = cases.steady(sensor, 0.3)
             except DeviceError:
                 continue  # a machine that does other work; no reading is no wrong reading
-            seen += sample.frames
+            readings_compared += sample.frames
             spread = np.sqrt(np.diagonal(sample.covariance))
             assert np.all(np.abs(sample.wrench - mean) < 6 * noise / np.sqrt(sample.frames) + off)
             assert np.all(spread < 3 * noise)  # one wrong frame would be a gross outlier
-        assert seen > 100
+        assert readings_compared > 100
         count = sensor.losses()
         assert count.corrupt > 0
         assert count.skipped > 0

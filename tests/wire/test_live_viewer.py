@@ -124,17 +124,17 @@ def revisions(recording):
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path):
-    run, told = store_campaign(tmp_path / "run.hilcal"), tmp_path / "told.txt"
-    for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
+    run, log_file = store_campaign(tmp_path / "run.hilcal"), tmp_path / "told.txt"
+    for word, expected in (("add", {1, 2}), ("remove", {1, 2, 3})):
         late = tmp_path / f"{word}.rrd"
         line = [sys.executable, "-m", "hilcal", word, str(run), BASE, "--view"]
-        with told.open("w") as out:
+        with log_file.open("w") as out:
             process = subprocess.Popen(line, stdout=out, stderr=out)
-        wait_until(lambda: URL.search(told.read_text()) is not None, "served", LONG)
-        with follower(told.read_text(), late):
-            assert process.wait(LONG) == 0, told.read_text()
+        wait_until(lambda: URL.search(log_file.read_text()) is not None, "served", LONG)
+        with follower(log_file.read_text(), late):
+            assert process.wait(LONG) == 0, log_file.read_text()
             # what it had sent when it ended
             wait_until(lambda late=late: revisions(late), "seen", LONG)
         recording = run.with_name("run.live.rrd")
-        assert revisions(recording) == seen
+        assert revisions(recording) == expected
         assert RrdReader(recording).store() is not None  # it has its footer: whole

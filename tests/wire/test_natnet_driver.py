@@ -193,11 +193,13 @@ def test_the_client_of_others_reads_the_same(version):
         with opened(host, rigid_body="tool") as device:
             sample = device.measure()
     assert {d.name: d.id_num for d in described[0].rigid_bodies} == {"tool": 7, "other 0": 8}
-    own = [next(b for b in frame if b.id_num == 7) for frame in bodies]
-    seen = np.array([b.pos for b in own])
-    K = len(seen)
+    body_frames = [next(b for b in frame if b.id_num == 7) for frame in bodies]
+    positions = np.array([b.pos for b in body_frames])
+    K = len(positions)
     assert K >= 50
-    assert seen.mean(axis=0) == pytest.approx(sample.value[:3], abs=6 * FRAME_STD / np.sqrt(20))
-    turn = Rotation.from_quat([b.rot for b in own]).mean()
+    assert positions.mean(axis=0) == pytest.approx(
+        sample.value[:3], abs=6 * FRAME_STD / np.sqrt(20)
+    )
+    turn = Rotation.from_quat([b.rot for b in body_frames]).mean()
     assert (turn * Rotation.from_rotvec(sample.value[3:]).inv()).magnitude() < 1e-3
     assert all(b.tracking_valid for frame in bodies for b in frame)

@@ -115,13 +115,13 @@ def sits(*requests):
 
 def test_the_person_is_asked_and_presses_enter():
     asked = (["5kg", ""], ["pull", "the sensor feels 49.0 N instead"], [None, ""])
-    told = (
+    expected = (
         ("Hang the load 5kg at the load point [0.1, -0.03, 0.15] m", "5 kg, 49.0 N"),
         ("feels 49.0 N instead", "[80, 10, 0] N, base axes", "[0, 6, -3] N·m, base axes"),
         ("Take every load off",),
     )
     with sits(*asked) as person:
-        for k, words in enumerate(told):
+        for k, words in enumerate(expected):
             person.wait_for_words(ASKED, k + 1)
             question = person.text.rpartition("hung")[2]
             assert all(part in question for part in words)
@@ -207,8 +207,8 @@ def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(cell
                 safe = campaign.n_readings
             assert safe >= 2
             planned = len(cell.plan.steps)
-            told = f"the arm stands, {safe} of {planned} readings are safe; go on with:"
-            assert told in person.text
+            expected = f"the arm stands, {safe} of {planned} readings are safe; go on with:"
+            assert expected in person.text
             # the line to copy stands alone, and what was asked stands above it
             assert person.lines[-1] == f"  hilcal run cell.toml -o {path.name} --resume"
             assert person.text.count("Take every load off the tool") == 1
@@ -243,8 +243,8 @@ def test_check_gives_every_fact_as_a_field(cell, toml, capsys):
     assert devices["arm"]["facts"]["payload"].startswith(f"{arm['payload_kg']:.3f} kg")
     assert arm["serial_number"] == devices["arm"]["facts"]["serial number"]
     assert len(arm["joint_temperature_degC"]) == 6
-    told = devices["arm"]["facts"]["joint temperatures"]
-    assert told == ", ".join(f"{t:.1f}" for t in arm["joint_temperature_degC"]) + " °C"
+    temperatures = devices["arm"]["facts"]["joint temperatures"]
+    assert temperatures == ", ".join(f"{t:.1f}" for t in arm["joint_temperature_degC"]) + " °C"
     assert devices["tracker"]["facts"]["target"].startswith(f"{tracker['distance_m']:.4f} m")
     assert tracker["locked"] is True
     assert tracker["std_across_m"] < 1e-4

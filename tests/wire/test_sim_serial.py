@@ -196,11 +196,11 @@ def test_noise_is_as_specified_and_fresh(target, scale):
     options = ("--range-std", "20e-6", "10e-6", "--transverse-std", "50e-6", "30e-6")
     options += ("--baud", "1000000")
     with tracker(target, *options, scale=scale) as station, Line(station, 1_000_000) as line:
-        seen = np.array([line.point()[1] for _ in range(count)])
+        points = np.array([line.point()[1] for _ in range(count)])
     sight = np.array(target) / d
     left = np.array([-sight[1], sight[0], 0.0]) / np.hypot(sight[0], sight[1])
     axes = np.array([sight, left, np.cross(sight, left)])
-    error = (seen - np.array(target)) @ axes.T / np.array([along, across, across])
+    error = (points - np.array(target)) @ axes.T / np.array([along, across, across])
     low, high = stats.chi2.ppf([1e-6, 1 - 1e-6], count)
     assert np.all((low < (error**2).sum(axis=0)) & ((error**2).sum(axis=0) < high))
     assert np.all(np.abs(error.mean(axis=0)) < 5 / np.sqrt(count))

@@ -146,8 +146,8 @@ def test_forward_kinematics_is_that_of_the_nominal_arm(sim):
     tool = [0.1, -0.05, 0.2, 0.3, -0.4, 0.5]
     with client(sim.host, "control", "receive") as run:
         assert run("control", "setTcp", tool)
-        told = run("control", "getForwardKinematics")
-        learns(run, "receive", "getActualTCPPose", lambda p: np.allclose(p, told, atol=1e-4))
+        pose = run("control", "getForwardKinematics")
+        learns(run, "receive", "getActualTCPPose", lambda p: np.allclose(p, pose, atol=1e-4))
         assert run("control", "setTcp", [0.0] * 6)
     place = np.eye(4)
     links = load_arm("ur10e").links
@@ -158,8 +158,8 @@ def test_forward_kinematics_is_that_of_the_nominal_arm(sim):
     offset = np.eye(4)
     offset[:3, :3], offset[:3, 3] = turned(tool[3:]), tool[:3]
     expected = place @ offset
-    np.testing.assert_allclose(told[:3], expected[:3, 3], atol=1e-9)
-    np.testing.assert_allclose(turned(told[3:]), expected[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(pose[:3], expected[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(turned(pose[3:]), expected[:3, :3], atol=1e-9)
 
 
 Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
@@ -248,9 +248,9 @@ def test_the_truth_is_what_the_sensors_tell(tmp_path):
 def test_an_address_in_use_is_refused(tmp_path, port):
     Blackboard.create(tmp_path / "world.bin", 1.0)
     host = free_host()
-    with socket.socket() as taken:
-        taken.bind((host, port))
-        taken.listen()
+    with socket.socket() as occupied:
+        occupied.bind((host, port))
+        occupied.listen()
         process = server(tmp_path, host)
         process.start()
         wait_until(lambda: process.has_ended, "ended")

@@ -194,11 +194,11 @@ def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
 
 @pytest.mark.long
 def test_an_address_that_another_program_took_is_not_insisted_on(tmp_path, monkeypatch):
-    taken, free = free_host(), free_host()
-    hosts = iter([taken, free])
+    used_host, free = free_host(), free_host()
+    hosts = iter([used_host, free])
     monkeypatch.setattr(cell_processes, "free_host", lambda: next(hosts))
     with socket.socket() as line:
-        line.bind((taken, UR_PORTS[0]))
+        line.bind((used_host, UR_PORTS[0]))
         line.listen()
         with start(tmp_path) as cell:
             assert cell.config.robot.host == free

@@ -140,8 +140,10 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
 
 
 def test_another_centre_of_mass_than_was_set_is_told(arm, monkeypatch):
-    told = Control.set_payload
-    monkeypatch.setattr(Control, "set_payload", lambda c, mass, com: told(c, mass, com + 0.01))
+    set_payload = Control.set_payload
+    monkeypatch.setattr(
+        Control, "set_payload", lambda c, mass, com: set_payload(c, mass, com + 0.01)
+    )
     with pytest.raises(DeviceError, match=r"it reports 4 kg at .* after a payload of 4 kg at"):
         arm.set_payload(4.0, cases.COM)
 

@@ -324,11 +324,11 @@ def test_what_was_measured_is_found_again(how, when, tmp_path, monkeypatch):
             if when == "before a store":
                 log.record(_reading(STEPS[2]), STEPS[2], {})
 
-    with pytest.raises(MovedFileError) as told:
+    with pytest.raises(MovedFileError) as raised:
         measure()
-    assert str(told.value).startswith(f"{path}: deleted, replaced or moved")
-    assert "all 2 readings" in str(told.value)
-    place = _found(told.value)
+    assert str(raised.value).startswith(f"{path}: deleted, replaced or moved")
+    assert "all 2 readings" in str(raised.value)
+    place = _found(raised.value)
     assert place != path
     with CampaignFile.open(place) as file:
         assert RunLog(file).done() == frozenset(STEPS[:2])
@@ -344,10 +344,10 @@ def test_a_rescued_copy_replaces_no_file(tmp_path):
     file = _campaign(path)
     RunLog(file).record(_reading(STEPS[0]), STEPS[0], {})
     path.unlink()
-    with pytest.raises(MovedFileError) as told, file:
+    with pytest.raises(MovedFileError) as raised, file:
         pass
     assert there.read_text() == "kept"
-    assert _found(told.value).name == "run.rescued-2.hilcal"
+    assert _found(raised.value).name == "run.rescued-2.hilcal"
 
 
 def test_a_link_to_a_campaign_is_its_place(tmp_path):
@@ -408,13 +408,13 @@ def _lost(tmp_path, batches, tries, writer=POWER_WRITER, syncs=4):
     recorder = power_loss.compiled(tmp_path)
     ops = power_loss.recorded(writer.replace("BATCHES", str(batches)), folder, recorder, ROOT)
     assert sum(op.kind == "sync" for op in ops) >= syncs * batches, "the recorder sees no syncs"
-    whole, count, seen = simple_readings(batches), 0, set()
+    whole, count, names = simple_readings(batches), 0, set()
     after = tmp_path / "after"
     for acknowledged, state in power_loss.crashes(ops, folder, "ack", 1, tries):
         content = tuple(sorted(state.items()))
-        if (acknowledged, content) in seen:
+        if (acknowledged, content) in names:
             continue
-        seen.add((acknowledged, content))
+        names.add((acknowledged, content))
         count += 1
         shutil.rmtree(after, ignore_errors=True)
         after.mkdir()

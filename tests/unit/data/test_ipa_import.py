@@ -81,10 +81,12 @@ def test_values_in_si(tmp_path):
 
 def test_covariance_is_that_of_the_mean_and_of_the_instrument(tmp_path):
     x = read(tmp_path, rows()).readings
-    own = x.covariance - tracker_covariance(x.value[:, :3], TRACKER, m=6)
+    covariance_alone = x.covariance - tracker_covariance(x.value[:, :3], TRACKER, m=6)
     spread = np.array([1e-5, 2e-5, 3e-5])
-    np.testing.assert_allclose(own[:, :3, :3], np.tile(np.diag(spread**2), (5, 1, 1)), atol=1e-22)
-    assert not own[:, :3, 3:].any()
+    np.testing.assert_allclose(
+        covariance_alone[:, :3, :3], np.tile(np.diag(spread**2), (5, 1, 1)), atol=1e-22
+    )
+    assert not covariance_alone[:, :3, 3:].any()
 
 
 def test_a_spread_of_zero_gets_a_floor(tmp_path):
@@ -148,8 +150,10 @@ def test_a_series_without_standard_deviations_and_temperature(tmp_path):
     path.write_text("\n".join(";".join(line[k] for k in kept) for line in lines))
     result = imported(path)
     np.testing.assert_array_equal(result.readings.value, whole.value)
-    own = result.readings.covariance - tracker_covariance(whole.value[:, :3], TRACKER, m=6)
-    np.testing.assert_allclose(own[:, range(3), range(3)], (2e-6) ** 2, rtol=1e-6)
+    covariance_alone = result.readings.covariance - tracker_covariance(
+        whole.value[:, :3], TRACKER, m=6
+    )
+    np.testing.assert_allclose(covariance_alone[:, range(3), range(3)], (2e-6) ** 2, rtol=1e-6)
     assert result.readings.states.air_temperature is None
     assert any("the table has no column 'measurement_std_x'" in note for note in result.notes)
     assert any("no air temperature" in note for note in result.notes)

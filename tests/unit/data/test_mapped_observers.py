@@ -92,8 +92,10 @@ def test_a_ball_bars_table_gives_the_true_compliances(seed, tmp_path):
     readings = with_joint_scatter(c.cell, replace(found, states=wrench), joint_std)
     fitted = fitted_model(c.cell, readings, "absolute")
     truth = true_parameters(c.world, "joint_compliance")
-    told = [v for k, v in parameters_by_effect(fitted).items() if k.startswith("joint_compliance")]
-    z = np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
+    compliances = [
+        v for k, v in parameters_by_effect(fitted).items() if k.startswith("joint_compliance")
+    ]
+    z = np.array([(value - t) / std for (value, std), t in zip(compliances, truth, strict=True)])
     assert np.sqrt(np.mean(z**2)) < 2.5
     assert 0.75 < fitted.variance_factor < 1.3
     torques = check_torques(c.cell, readings)

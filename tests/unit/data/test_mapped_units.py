@@ -119,8 +119,8 @@ def test_one_force_is_that_along_z(tmp_path):
 def test_wrenches_in_flange_axes_are_turned_to_those_of_the_base(tmp_path):
     r = evaluate(ARM, Q).rotation[-1]
     base = RNG.uniform(1, 20, (N, 2, 3))
-    own = np.einsum("nji,nkj->nki", r, base).reshape(N, 6)
-    columns = {f"{c}{a}": own[:, k] for k, (c, a) in enumerate(product("FM", "xyz"))}
+    in_flange_axes = np.einsum("nji,nkj->nki", r, base).reshape(N, 6)
+    columns = {f"{c}{a}": in_flange_axes[:, k] for k, (c, a) in enumerate(product("FM", "xyz"))}
     x = read(tmp_path, columns, wrench={"columns": list(columns), "axes": "flange"})
     np.testing.assert_allclose(x.states.wrench, base.reshape(N, 6), rtol=1e-9)
 

@@ -100,8 +100,8 @@ def readings_of(target, names=NAMES, seed=0):
     rng, count = np.random.default_rng(seed), len(target)
     pose = np.arange(count) % 2
     q, value = rng.uniform(-1.5, 1.5, (2, 6))[pose], rng.uniform(-0.5, 0.5, (count, 3))
-    own = {"pose_names": ("p1", "p2"), "covariance": np.tile(1e-10 * np.eye(3), (count, 1, 1))}
-    return readings_at(q, value, target=np.array(target), pose=pose, target_names=names, **own)
+    columns = {"pose_names": ("p1", "p2"), "covariance": np.tile(1e-10 * np.eye(3), (count, 1, 1))}
+    return readings_at(q, value, target=np.array(target), pose=pose, target_names=names, **columns)
 
 
 def table_of(path, *targets):

@@ -20,10 +20,10 @@ def covariance_of(readings):
     n, m, r = len(readings), readings.m, readings
     arrivals = r.arrivals
     full = np.zeros((n, m, n, m))
-    own = r.covariance if r.stated is None else r.stated
+    stated = r.covariance if r.stated is None else r.stated
     if r.common is not None:
-        own = r.covariance - r.common @ np.swapaxes(r.common, 1, 2)
-    root = symmetric_root(own)
+        stated = r.covariance - r.common @ np.swapaxes(r.common, 1, 2)
+    root = symmetric_root(stated)
     for i in range(n):
         for j in range(n):
             if i == j:
@@ -87,8 +87,8 @@ def test_whitened_noise_is_white(mode, m, kind):
     assert np.all(np.triu(white, 1) == 0)
     # The covariance of each by itself is as without correlation: what is stated holds.
     alone = d @ block_diag(*serial.covariance) @ d.T
-    own = np.einsum("kikj->kij", alone.reshape(len(w), m, len(w), m))
-    np.testing.assert_allclose(w.covariance, own, rtol=1e-9, atol=1e-12)
+    blocks = np.einsum("kikj->kij", alone.reshape(len(w), m, len(w), m))
+    np.testing.assert_allclose(w.covariance, blocks, rtol=1e-9, atol=1e-12)
 
 
 def test_units_do_not_matter():

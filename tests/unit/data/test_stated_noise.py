@@ -139,8 +139,8 @@ def covariances(run):
 
 def test_repeatability_is_added_to_an_imported_table(table, tmp_path, capsys):
     run = tmp_path / "run.hilcal"
-    told = ok(capsys, "import", table, "--config", CELL, "-o", run, "--json").document
-    assert told["covariance"] == "instrument and repeatability"
+    document = ok(capsys, "import", table, "--config", CELL, "-o", run, "--json").document
+    assert document["covariance"] == "instrument and repeatability"
     stored, full = covariances(run)
     cell = hc.Cell.load(CELL)
     with CampaignFile.open(run) as file:

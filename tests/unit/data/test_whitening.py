@@ -225,9 +225,13 @@ def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed, m):
     assert sorted(w.reading) == list(np.flatnonzero(~r.unloaded))
     np.testing.assert_array_equal(w.group, r.pose[w.reading])
     for k, row in enumerate(w.reading):
-        own = r.unloaded & (r.pose == r.pose[row]) & (r.cycle == r.cycle[row])
-        np.testing.assert_allclose(raw[k], r.value[row] - r.value[own].mean(axis=0), atol=1e-12)
-        expected = r.covariance[row] + r.covariance[own].sum(axis=0) / own.sum() ** 2
+        unloaded_alike = r.unloaded & (r.pose == r.pose[row]) & (r.cycle == r.cycle[row])
+        np.testing.assert_allclose(
+            raw[k], r.value[row] - r.value[unloaded_alike].mean(axis=0), atol=1e-12
+        )
+        expected = (
+            r.covariance[row] + r.covariance[unloaded_alike].sum(axis=0) / unloaded_alike.sum() ** 2
+        )
         np.testing.assert_allclose(w.covariance[k], expected, rtol=1e-12)
 
 

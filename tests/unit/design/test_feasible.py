@@ -161,12 +161,12 @@ def test_reasons_are_told_one_by_one_in_order():
     config = cell(obstacles=[TABLE], sight={"tracker_m": [-3.0, 0.0, 1.0]})
     space = space_of(config)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (300, 6))
-    told = space.reasons(q, "5kg")
-    assert list(told) == list(REASONS)
-    np.testing.assert_array_equal(np.all(list(told.values()), axis=0), space.allowed(q, "5kg"))
-    assert told["payload"].all()
+    reasons = space.reasons(q, "5kg")
+    assert list(reasons) == list(REASONS)
+    np.testing.assert_array_equal(np.all(list(reasons.values()), axis=0), space.allowed(q, "5kg"))
+    assert reasons["payload"].all()
     for reason in ("self-collision", "obstacle", "singularity", "sight", "hanging"):
-        assert 0 < told[reason].sum() < 300
+        assert 0 < reasons[reason].sum() < 300
 
 
 NOTHING = {
@@ -250,7 +250,7 @@ def test_where_the_tracker_stands():
     # the tracker's origin p: R p + t = 0 with R a quarter turn
     at = tracker_place(cell_from_config(config))
     np.testing.assert_allclose(at, [-1.0, 2.0, 0.5], atol=1e-12)
-    for sections, told in (
+    for sections, station in (
         ({"tracker": {"frame": "base", "station_m": [1, 2, 3]}}, [1, 2, 3]),
         ({"tracker": {"frame": "base"}, "sight": {"tracker_m": [3, 2, 1]}}, [3, 2, 1]),
         ({"sight": {"tracker_m": [3, 2, 1]}}, [3, 2, 1]),
@@ -259,8 +259,8 @@ def test_where_the_tracker_stands():
     ):
         config = cell(**sections)
         at = tracker_place(cell_from_config(config))
-        assert (at is None) == (told is None)
-        assert told is None or np.array_equal(at, told)
+        assert (at is None) == (station is None)
+        assert station is None or np.array_equal(at, station)
     assert any("tracker's place is not known" in line for line in drawn_of(cell(), 5).remarks)
 
 
@@ -287,8 +287,8 @@ def test_an_edited_plan_that_collides_is_refused_by_name():
     config = cell(obstacles=[TABLE])
     assert problems(config, HOME, (0.5, -1.0, 1.4, -1.2, -1.2, 0.3)) == ()
     folded = problems(config, HOME, (0.0, -1.5, 3.0, -1.5, -1.5, 0.0))
-    told = "pose p1: upper arm and wrist 1 collide: they overlap by "
-    assert any(line.startswith(told) for line in folded), folded
+    expected = "pose p1: upper arm and wrist 1 collide: they overlap by "
+    assert any(line.startswith(expected) for line in folded), folded
     low = problems(config, HOME, (0.0, 0.4, 0.3, -1.5, -1.5, 0.0))
     assert any(line.startswith("pose p1: forearm and table collide") for line in low)
     # what the ends do not show: over to the other side, through a post
@@ -423,13 +423,15 @@ def test_a_state_is_refused_by_all_or_by_none(c, seed, load):
     space, guard = FeasibleSpace(c, Margins()), Guard(c)
     for q in states(c, seed, 4):
         lines = route_problems(Feasibility(c), (Stop("p", q, load),))
-        told = [line for line in lines if "N·m" not in line]
-        assert told == [x.line("pose p") for x in space.findings(q[None], load, GEOMETRY)]
-        assert bool(told) is not space.allowed(q[None], load, GEOMETRY).all()
+        without_torques = [line for line in lines if "N·m" not in line]
+        assert without_torques == [
+            x.line("pose p") for x in space.findings(q[None], load, GEOMETRY)
+        ]
+        assert bool(without_torques) is not space.allowed(q[None], load, GEOMETRY).all()
         inside, apart = gaps(space.shapes, q, load)
-        outside = [x for x in told if "workspace" in x or "mounting plane" in x]
+        outside = [x for x in without_torques if "workspace" in x or "mounting plane" in x]
         assert bool(outside) == (inside < 0.0) or abs(inside) < 1e-6
-        assert apart >= 0.005 - 1e-9 or any("collide" in x for x in told)
+        assert apart >= 0.005 - 1e-9 or any("collide" in x for x in without_torques)
         said = stopped(guard, q, load)
         assert lines or said is None
         if inside < -SLACK_M - 1e-6 or apart < -1e-9:

@@ -157,9 +157,9 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
         both = np.einsum("nip,nij,njq->pq", jac[rows], weight, jac[rows])
         cross = np.einsum("nip,nij->pj", jac[rows], weight)
         schur = both - cross @ np.linalg.solve(weight.sum(axis=0), cross.T)
-        mine = units.units.rows[k].T @ units.units.rows[k]
+        information = units.units.rows[k].T @ units.units.rows[k]
         size = np.sqrt(np.outer(np.diag(both), np.diag(both)))
-        assert np.all(np.abs(mine - schur) <= 1e-9 * size)
+        assert np.all(np.abs(information - schur) <= 1e-9 * size)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -168,12 +168,12 @@ def test_what_was_measured_is_known_exactly(mode):
     found = fitted_model(c.cell, c.readings, mode)
     config = config_of(mode)
     p = problem(model_after(found, config), config, poses_of(3))
-    mine = predicted_uncertainty(p)
+    uncertainty = predicted_uncertainty(p)
     flat = np.isinf(found.solution.prior)
-    ratio = (mine.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
+    ratio = (uncertainty.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
     assert ratio == pytest.approx(np.ones(len(ratio)), rel=1e-6)
-    assert np.isinf(mine.std[flat & ~found.uncertainty.identifiable]).all()
-    identified = np.isfinite(mine.std)
+    assert np.isinf(uncertainty.std[flat & ~found.uncertainty.identifiable]).all()
+    identified = np.isfinite(uncertainty.std)
     assert np.all(identified == found.uncertainty.identifiable)
 
 
@@ -193,9 +193,9 @@ def test_planning_on_predicts_the_fit_to_all_readings():
     # The potential terms were measured as well: what is known of all together.
     wider = (*effects, "joint_stiffening")
     whole = fitted_model(cell, readings, "absolute", wider)
-    mine = later.information(everything_once(later))
-    mine[np.arange(12, 18), np.arange(12, 18)] -= 1.0
-    std = np.sqrt(np.diag(np.linalg.inv(mine))) * later.scale
+    information = later.information(everything_once(later))
+    information[np.arange(12, 18), np.arange(12, 18)] -= 1.0
+    std = np.sqrt(np.diag(np.linalg.inv(information))) * later.scale
     assert std == pytest.approx(whole.uncertainty.formal, rel=0.02)
 
 
@@ -219,12 +219,12 @@ def test_averaging_leaves_the_systematic_share(m):
     stated = []
     for _ in range(600):
         shared = rng.multivariate_normal(np.zeros(m), 0.3 * sample)
-        own = rng.multivariate_normal(np.zeros(m), 0.7 * sample, 5)
-        samples = [TrackerSample(k, x + shared, sample) for k, x in enumerate(own)]
+        own_samples = rng.multivariate_normal(np.zeros(m), 0.7 * sample, 5)
+        samples = [TrackerSample(k, x + shared, sample) for k, x in enumerate(own_samples)]
         stated.append(average(samples, 0.3).covariance)
-    mine = reading_covariance(a, config, prediction)[0]
-    size = np.sqrt(np.outer(np.diag(mine), np.diag(mine)))
-    assert np.max(np.abs(np.mean(stated, axis=0) - mine) / size) < 0.02
+    planned = reading_covariance(a, config, prediction)[0]
+    size = np.sqrt(np.outer(np.diag(planned), np.diag(planned)))
+    assert np.max(np.abs(np.mean(stated, axis=0) - planned) / size) < 0.02
 
 
 def test_units_are_what_may_be_taken():
@@ -278,9 +278,9 @@ def test_what_cannot_be_seen_has_no_uncertainty():
     p = problem(a, config, poses_of(1))
     only = np.array([float(loads == ("5kg",)) for _, loads in p.contents])
     work = prediction_poses(a, config, poses_of(5))
-    mine = predicted_uncertainty(p, only, work=work)
-    assert np.isinf(mine.std).any()  # three numbers measured, six compliances
-    assert np.isinf(mine.position)
+    uncertainty = predicted_uncertainty(p, only, work=work)
+    assert np.isinf(uncertainty.std).any()  # three numbers measured, six compliances
+    assert np.isinf(uncertainty.position)
     assert np.isfinite(predicted_uncertainty(p, everything_once(p) * 0 + 1.0).std).any()
 
 
@@ -354,10 +354,10 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
 def test_potential_terms_only_add_uncertainty():
     problems = made(), made(against=())
     work = prediction_poses(problems[0].nominal, config_of("deflection"), poses_of(5, 9))
-    mine, bare = (predicted_uncertainty(p, everything_once(p), work=work) for p in problems)
-    assert mine.std == pytest.approx(bare.std, rel=1e-9)
+    uncertainty, bare = (predicted_uncertainty(p, everything_once(p), work=work) for p in problems)
+    assert uncertainty.std == pytest.approx(bare.std, rel=1e-9)
     assert bare.position_open == pytest.approx(bare.position, rel=1e-9)
-    assert mine.position_open > bare.position
+    assert uncertainty.position_open > bare.position
 
 
 def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
@@ -442,9 +442,9 @@ def std(of):
 def test_what_is_known_is_in_the_prediction():
     alone, known = std(problem_with(None)), std(problem_with(carried_prior(learnt())))
     assert known.keys() == alone.keys()
-    own = dict(zip(learnt().names, learnt().std, strict=True))
+    carried_std = dict(zip(learnt().names, learnt().std, strict=True))
     for name in learnt().names:
-        assert known[name] < min(alone[name], own[name])
+        assert known[name] < min(alone[name], carried_std[name])
 
 
 def test_effects_that_only_the_prior_knows_are_planned_for():
@@ -487,13 +487,13 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
     assert len(of.contents) == len(first) * 5
     information = of.information(np.ones(len(of.contents))) - of.prior + of.measured
     names = [t.name for t in of.terms]
-    own = [k for k, name in enumerate(names) if name.startswith("joint_compliance")]
+    compliances = [k for k, name in enumerate(names) if name.startswith("joint_compliance")]
     frames = [k for k, name in enumerate(names) if name.startswith("observer_frame")]
-    kept = np.array([*own, *frames])
+    kept = np.array([*compliances, *frames])
     covariance = np.linalg.pinv(information[np.ix_(kept, kept)], rcond=1e-12)
-    std = np.sqrt(np.diagonal(covariance))[: len(own)] * of.scale[own]
+    std = np.sqrt(np.diagonal(covariance))[: len(compliances)] * of.scale[compliances]
     fitted = parameters_by_effect(f)
-    for name, planned in zip((names[k] for k in own), std, strict=True):
+    for name, planned in zip((names[k] for k in compliances), std, strict=True):
         if np.isfinite(fitted[name][1]):
             assert planned == pytest.approx(fitted[name][1], rel=0.25), name
 
@@ -525,11 +525,11 @@ def test_sight_and_time_of_each_target():
     counts = set()
     for tracker in ([3.0, 0.5, 0.4], [-2.0, 0.0, 0.5], [0.0, 0.0, 2.5]):
         view = LineOfSight(Clearance(cell.with_config(several)), np.array(tracker))
-        seen = np.array([view.target_visible(q, "none", k) for k in range(3)])
-        np.testing.assert_array_equal(view.unobstructed(q, "none"), seen.all(axis=0))
+        visible = np.array([view.target_visible(q, "none", k) for k in range(3)])
+        np.testing.assert_array_equal(view.unobstructed(q, "none"), visible.all(axis=0))
         for k in range(len(q)):
             hidden = view.hidden_targets(q[k : k + 1], "none")
-            assert hidden == tuple(np.flatnonzero(~seen[:, k]))
+            assert hidden == tuple(np.flatnonzero(~visible[:, k]))
             problems = " ".join(view.problems(q[k : k + 1], "none", "here"))
             assert ("between tracker and targets" in problems) == (len(hidden) == 3)
             counts.add(len(hidden))

@@ -116,8 +116,8 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
         criterion=MeanVariance(plain.criterion.c * np.outer(size, size)),
     )
     counts = np.ones(len(of.units))
-    told = [variance_of(d, counts) for d in (plain, balanced(uneven))]
-    assert told[1] == pytest.approx(told[0], rel=1e-6)
+    variances = [variance_of(d, counts) for d in (plain, balanced(uneven))]
+    assert variances[1] == pytest.approx(variances[0], rel=1e-6)
     found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
     assert found[1] == pytest.approx(found[0], rel=1e-4)
 

@@ -276,8 +276,8 @@ def test_no_plan_exceeds_the_bound(name, seed, costs, known, most):
     assert design.counts.min() >= 0
     assert most is None or design.counts.max() <= most
     assert 0 < design.efficiency <= 1
-    own = base + units.information(design.counts.astype(float))
-    assert design.value == pytest.approx(float(criterion.value(own)), rel=1e-9)
+    of_design = base + units.information(design.counts.astype(float))
+    assert design.value == pytest.approx(float(criterion.value(of_design)), rel=1e-9)
     assert design.efficiency == pytest.approx(min(1, design.value / design.bound))
     relaxed = design.relaxed
     assert relaxed.weight @ units.cost[relaxed.index] <= 9.0 * (1 + 1e-9)

@@ -73,17 +73,17 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
     how = Ordering(slack, unloaded, every, repeats=1, draws=3)
     made = world.ordered(chosen, seed, how)
     plan = made.plan
-    taken = [s for s in plan.steps if s.pose != REFERENCE]
+    steps = [s for s in plan.steps if s.pose != REFERENCE]
 
     assert len(set(plan.steps)) == len(plan.steps)
     wanted = Counter((c.pose, load) for c in chosen for load in c.loads for _ in range(c.cycles))
-    extra = Counter((s.pose, s.load) for s in taken) - wanted
-    assert not wanted - Counter((s.pose, s.load) for s in taken)
+    extra = Counter((s.pose, s.load) for s in steps) - wanted
+    assert not wanted - Counter((s.pose, s.load) for s in steps)
     assert sum(extra.values()) <= 1  # the repeat
     assert all(load == UNLOADED for _, load in extra)
     assert all(Step(s.pose, UNLOADED, s.cycle) in plan.steps for s in plan.steps)
-    arrivals = dict.fromkeys((s.pose, s.cycle) for s in taken)
-    cycles = [tuple(sorted(s.load for s in taken if (s.pose, s.cycle) == k)) for k in arrivals]
+    arrivals = dict.fromkeys((s.pose, s.cycle) for s in steps)
+    cycles = [tuple(sorted(s.load for s in steps if (s.pose, s.cycle) == k)) for k in arrivals]
     together = Counter(tuple(sorted(c.loads)) for c in chosen for _ in range(c.cycles))
     assert not together - Counter(cycles)  # what shares an unloaded reading is as it was chosen
 
@@ -126,8 +126,8 @@ def test_absolute_readings_of_a_pose_share_no_more_than_they_must():
         PoseReadings("p1", (LOADS[1],)),
     ]
     plan = world.ordered(chosen, 0, Ordering(repeats=0)).plan
-    taken = {(s.pose, s.load, s.cycle) for s in plan.steps if s.pose != REFERENCE}
-    assert taken == {
+    steps = {(s.pose, s.load, s.cycle) for s in plan.steps if s.pose != REFERENCE}
+    assert steps == {
         *(("p0", load, cycle) for load in (UNLOADED, LOADS[0]) for cycle in (0, 1)),
         ("p1", LOADS[1], 0),
     }
@@ -212,13 +212,13 @@ def test_orders_under_different_loads_are_independent():
 def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
     _, made = _large()
     ordered = made[0]
-    plan, told = ordered.plan, ordered.confounding
+    plan, confounding = ordered.plan, ordered.confounding
     _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
     when = dict(zip(plan.steps, times, strict=True))
     rows = [s for s in plan.steps if s.pose != REFERENCE and s.load != UNLOADED]
     lag = np.array([when[s] - when[Step(s.pose, UNLOADED, s.cycle)] for s in rows])
     wrench = {load.name: load.wrench(CELL.gravity) for load in CONFIG.loads}
-    component, *product = told.regressor.split()
+    component, *product = confounding.regressor.split()
     k = ["fx", "fy", "fz", "mx", "my", "mz"].index(component)
     column = np.array([wrench[s.load][k] for s in rows])
     if product:
@@ -226,10 +226,10 @@ def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
         column = column * (np.cos(angle) if product[0] == "cos" else np.sin(angle))
     both = np.stack([column, lag], axis=1)
     alone, beside = 1 / (column @ column), np.linalg.inv(both.T @ both)[0, 0]
-    assert alone / beside == pytest.approx(1 - told.correlation**2, rel=1e-9)
-    assert told.error_m == pytest.approx(told.drift * np.sqrt(np.mean(lag**2)))
-    assert told.bias_m == pytest.approx(told.drift * np.mean(lag))
-    assert told.deflections == len(rows)
+    assert alone / beside == pytest.approx(1 - confounding.correlation**2, rel=1e-9)
+    assert confounding.error_m == pytest.approx(confounding.drift * np.sqrt(np.mean(lag**2)))
+    assert confounding.bias_m == pytest.approx(confounding.drift * np.mean(lag))
+    assert confounding.deflections == len(rows)
 
 
 @pytest.mark.long

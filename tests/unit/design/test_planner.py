@@ -115,15 +115,15 @@ def test_no_load_costs_too_much_where_hanging_one_costs_nothing(usual):
 
 
 def test_the_summary_is_consistent(usual):
-    told = summarise(usual, small(), np.random.default_rng(2), lambda words: None)
-    assert told.readings == len(usual.ordered.plan.steps) == sum(told.loads.values())
-    assert {b.criterion for b in told.criteria} == {"D", "A", "E", "K", "I"}
-    best = {b.criterion: b for b in told.criteria}
-    assert best["E"].o3 >= 0.98 * max(b.o3 for b in told.criteria)
-    stds = [point.position_std_m for point in told.curve]
+    summary = summarise(usual, small(), np.random.default_rng(2), lambda words: None)
+    assert summary.readings == len(usual.ordered.plan.steps) == sum(summary.loads.values())
+    assert {b.criterion for b in summary.criteria} == {"D", "A", "E", "K", "I"}
+    best = {b.criterion: b for b in summary.criteria}
+    assert best["E"].o3 >= 0.98 * max(b.o3 for b in summary.criteria)
+    stds = [point.position_std_m for point in summary.curve]
     assert stds == sorted(stds, reverse=True)
-    assert {s.effect for s in told.detectable} == {"joint_tilt_compliance"}
-    assert all(s.least_m is not None and 1e-7 < s.least_m < 1e-3 for s in told.detectable)
+    assert {s.effect for s in summary.detectable} == {"joint_tilt_compliance"}
+    assert all(s.least_m is not None and 1e-7 < s.least_m < 1e-3 for s in summary.detectable)
 
 
 def cell_file(directory, config):
@@ -373,9 +373,11 @@ def test_each_criterion_is_best_at_its_own(usual):
         asked = objective_of(of, small(), name, work)
         values = {}
         for other, made in designs.items():
-            own = objective_of(made.problem, small(), name, made.work)
-            taken = np.flatnonzero(made.counts)
-            m = own.prior + own.units.information(made.counts[taken], taken)
+            objective = objective_of(made.problem, small(), name, made.work)
+            chosen_units = np.flatnonzero(made.counts)
+            m = objective.prior + objective.units.information(
+                made.counts[chosen_units], chosen_units
+            )
             values[other] = float(asked.criterion.value(m))
         assert values[name] >= 0.97 * max(values.values()), (name, values)
 

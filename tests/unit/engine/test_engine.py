@@ -101,18 +101,18 @@ def test_a_signal_leaves_no_process_and_no_folder(kind, tmp_path):
         os.killpg(process.pid, kind)
     else:  # as a service manager does
         process.send_signal(kind)
-    told = process.communicate(timeout=30)[1]
+    stderr = process.communicate(timeout=30)[1]
     _, alive = psutil.wait_procs(workers, timeout=5)
     assert not alive
     if kind is signal.SIGKILL:  # nothing can be tidied
         return
     assert not list(tmp_path.glob("hilcal-workers-*"))
     if kind is signal.SIGINT:
-        assert told.count("Traceback") == 1  # of the program itself, which does not catch it
-        assert told.rstrip().endswith("KeyboardInterrupt")
+        assert stderr.count("Traceback") == 1  # of the program itself, which does not catch it
+        assert stderr.rstrip().endswith("KeyboardInterrupt")
     else:
         assert process.returncode == 128 + kind
-        assert "Traceback" not in told
+        assert "Traceback" not in stderr
 
 
 def deaf(pid, number):
@@ -231,9 +231,9 @@ def openssl(folder, *arguments):
 def tls(folder, name):
     """Dask's configuration of an authority's certificate, for scheduler, worker and client."""
     at = "distributed.comm.tls"
-    own = {"cert": f"{folder}/{name}-own.pem", "key": f"{folder}/{name}-own.key"}
+    certificate = {"cert": f"{folder}/{name}-own.pem", "key": f"{folder}/{name}-own.key"}
     roles = {f"{at}.{role}.{k}": v for role in ("scheduler", "worker", "client")
-             for k, v in own.items()}  # fmt: skip
+             for k, v in certificate.items()}  # fmt: skip
     return {f"{at}.ca-file": f"{folder}/{name}.pem", **roles}
 
 

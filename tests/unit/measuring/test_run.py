@@ -61,8 +61,8 @@ def test_readings_are_what_the_world_is(ran):
     assert np.array_equal(readings.states.q, q)
     chain = chains.evaluate(b.cell.arm, q)
     held = chain.point(b.cell.target[:3, 3]) + SAG * readings.states.wrench[:, :3]
-    seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
-    white = (readings.value - seen) / np.sqrt(STD**2 / 3)
+    in_tracker = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
+    white = (readings.value - in_tracker) / np.sqrt(STD**2 / 3)
     assert 0.4 < np.mean(white**2) < 1.8  # 45 numbers of unit variance
     ratio = np.sqrt(np.diagonal(readings.covariance, axis1=1, axis2=2)) / STD * np.sqrt(3)
     assert np.all(ratio > 0.8)
@@ -132,9 +132,9 @@ def test_times_and_temperatures(ran):
     assert np.all(s.load_time > 0)
     assert np.all(s.load_time <= s.time)
     for load in ("3kg", "pull"):  # counts from the change of the load
-        mine = rows(readings, load)
-        assert np.allclose(np.diff(s.load_time[mine]), np.diff(s.time[mine]))
-        assert s.load_time[mine][0] < 20.0
+        of_load = rows(readings, load)
+        assert np.allclose(np.diff(s.load_time[of_load]), np.diff(s.time[of_load]))
+        assert s.load_time[of_load][0] < 20.0
     assert np.allclose(s.joint_temperature, 30.0)
     assert np.allclose(s.q_actual, s.q)
 
@@ -156,25 +156,25 @@ def test_progress(ran):
     assert [d["over"] for d in drifts] == [False, False]
     assert not b.remarks("has moved")
     assert not b.remarks("[tool]")
-    taken = b.notes.of_kind(ReadingStored)
-    assert [t.stored for t in taken] == list(range(1, len(plan.steps) + 1))
-    assert {t.total for t in taken} == {len(plan.steps)}
-    assert taken[-1].remaining_s == 0.0
-    for t in taken:
+    stored = b.notes.of_kind(ReadingStored)
+    assert [t.stored for t in stored] == list(range(1, len(plan.steps) + 1))
+    assert {t.total for t in stored} == {len(plan.steps)}
+    assert stored[-1].remaining_s == 0.0
+    for t in stored:
         if t.step.load == "none":
             assert t.deflection is None
         else:
             force = 3.0 * 9.80665 if t.step.load == "3kg" else 40.0
             assert t.deflection == pytest.approx(SAG * force, abs=6 * STD)
     tenth = json.loads(b.store.rows[9][2])["tracker"][-1]["host_ns"] * 1e-9
-    assert taken[9].remaining_s == pytest.approx(b.world.time - tenth, rel=0.5)
+    assert stored[9].remaining_s == pytest.approx(b.world.time - tenth, rel=0.5)
 
 
 def test_the_judge_sees_all_readings_and_may_not_know(b):
-    seen = []
+    judged = []
 
     def judge(readings):
-        seen.append(len(readings))
+        judged.append(len(readings))
         if len(readings) == 2:
             raise CannotAnswerError("too few readings")
         if len(readings) == 3:  # of linear algebra, which knows no campaign
@@ -182,10 +182,10 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
         return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
     b.measure(live=judge)
-    assert seen == list(range(1, len(FEW_POSES.steps) + 1))
-    taken = b.notes.of_kind(ReadingStored)
-    assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
-    assert taken[-1].live.sigma == 0.5
+    assert judged == list(range(1, len(FEW_POSES.steps) + 1))
+    stored = b.notes.of_kind(ReadingStored)
+    assert [t.live.residual for t in stored[:4]] == [None, None, None, 1e-5]
+    assert stored[-1].live.sigma == 0.5
 
 
 def test_a_campaign_that_goes_on_shows_from_the_start_what_is_stored():
@@ -386,9 +386,9 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     b.world.wrong_loads = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
-    seen = len(b.operator.requests)
+    asked_before = len(b.operator.requests)
     b.measure(usual_plan())
-    asked = b.operator.requests[seen:]
+    asked = b.operator.requests[asked_before:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "than in the unloaded readings so far; 3kg still seems to hang" in asked[1][1]
     assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)

@@ -259,9 +259,9 @@ def test_another_reflector_is_noticed_before_the_registration_is_known():
         known.add(joints[1], places[1])
         assert known.implausible(joints[2], places[2]) is None
         stray = places[2] + 0.3 * rng.standard_normal(3)
-        told = known.implausible(joints[2], stray)
-        noticed += told is not None
-        assert told is None or "does it follow another reflector" in told
+        reason = known.implausible(joints[2], stray)
+        noticed += reason is not None
+        assert reason is None or "does it follow another reflector" in reason
     assert noticed > 25
 
 
@@ -583,8 +583,8 @@ def test_drift_that_ends_is_waited_for():
 
     change_result(b.world, "position", settles)
     b.measure(few)
-    taken = b.notes.of_kind(ReadingStored)
-    assert min(t.settling for t in taken) > 1.0
+    stored = b.notes.of_kind(ReadingStored)
+    assert min(t.settling for t in stored) > 1.0
     quiet = Bench()
     quiet.measure(few)
     assert max(t.settling for t in quiet.notes.of_kind(ReadingStored)) < 1.0

@@ -132,8 +132,8 @@ def test_a_goal_that_is_never_met():
     assert steps(b) == list(plan.steps)
     assert rule.asked == [(k, k == 15) for k in range(1, 16)]
     assert b.store.kinds().count("goal") == 1
-    told = b.store.last("goal")
-    assert (told["met"], told["readings"], told["planned"]) == (False, 15, 15)
+    last_goal = b.store.last("goal")
+    assert (last_goal["met"], last_goal["readings"], last_goal["planned"]) == (False, 15, 15)
     assert not b.notes.of_kind(GoalMet)
 
 

@@ -190,9 +190,9 @@ def test_a_tracker_that_was_moved_between_sessions_is_asked_about(moved, asked, 
     plan = plan_of(("reference", "none", 0), ("p1", "none", 0), ("reference", "none", 1))
     b.interrupt(2, plan)
     if elsewhere:  # the readings of before are in another file, as of a calibration that is tested
-        seen = b.store.readings().value[0, :3].tolist()
+        first_reading = b.store.readings().value[0, :3].tolist()
         b.store.rows.clear()
-        plan = replace(plan, about={"reference_seen_m": seen})
+        plan = replace(plan, about={"reference_seen_m": first_reading})
     b.world.shift = np.array([0.0, moved, 0.0])
     b.measure(plan)
     questions = [q for q in confirmed(b) if "mm from where it was before" in q]
@@ -219,8 +219,10 @@ def test_a_tracker_that_is_moved_between_two_readings_is_asked_about_at_the_next
     readings = b.measure()
     assert [q[:38] for q in confirmed(b)] == ["the target at the reference pose is 20"]
     assert {"moved", "doubted"} <= set(b.store.kinds())
-    seen = readings.value[readings.pose == 0]
-    assert np.linalg.norm(seen[-1] - seen[0]) == pytest.approx(0.0 if put_back else 0.02, abs=1e-3)
+    at_reference = readings.value[readings.pose == 0]
+    assert np.linalg.norm(at_reference[-1] - at_reference[0]) == pytest.approx(
+        0.0 if put_back else 0.02, abs=1e-3
+    )
     assert not len(FEW_POSES.without(b.store.done()).steps)
 
 
@@ -527,18 +529,18 @@ def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
 
 
 def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(b, monkeypatch):
-    taken = []
+    samples = []
     averaged = Measurer._averaged
 
     def settled(*arguments):
-        taken.extend([0] * (len(b.store.rows) == 1))
+        samples.extend([0] * (len(b.store.rows) == 1))
         return averaged(*arguments)
 
     monkeypatch.setattr(Measurer, "_averaged", settled)
 
     def leans():
-        taken.extend([0] * bool(taken))
-        now = len(taken) in (3, 4)  # the second and the third of three
+        samples.extend([0] * bool(samples))
+        now = len(samples) in (3, 4)  # the second and the third of three
         b.world.extra, b.world.shift = 60.0 * now * np.eye(6)[1], 1.2e-3 * now * np.eye(3)[1]
 
     def lets_go(seconds):

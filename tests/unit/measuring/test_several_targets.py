@@ -115,8 +115,8 @@ def test_each_target_is_read_at_each_stop(tmp_path):
     assert [e.stored for e in b.notes.of_kind(ReadingStored)] == list(range(1, stops + 1))
     chain = chains.evaluate(b.cell.arm, r.states.q)
     held = chain.point(OFFSETS[r.target]) + SAG * r.states.wrench[:, :3]
-    seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
-    assert np.abs(r.value - seen).max() < 6 * STD
+    in_tracker = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
+    assert np.abs(r.value - in_tracker).max() < 6 * STD
     assert np.all(np.diff(r.states.time) > 0)
 
 

@@ -96,8 +96,8 @@ def test_jacobians_are_slopes(name, size):
         expected = motion_by(arm, q, d, Deviation(dq=change), OFFSET)
         assert_close_relative(by_joint[:, :, j], expected)
     for k in range(arm.n + 1):
-        own = None if chain.twist is None else chain.twist[k]
-        by_slot = twist_jacobian(chain.rotation[k], x - chain.position[k], own)
+        own_twist = None if chain.twist is None else chain.twist[k]
+        by_slot = twist_jacobian(chain.rotation[k], x - chain.position[k], own_twist)
         for axis in range(6):
             twist = np.zeros((count, arm.n + 1, 6))
             twist[:, k, axis] = 1.0

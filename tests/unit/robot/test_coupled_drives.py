@@ -128,14 +128,14 @@ def test_laws_of_coupled_drives_are_the_worlds(law, mechanical):
     effects = tuple(make(n, cell, states, options.get(n, {})) for n in names)
     model = Model(cell, effects)
     theta = np.concatenate([true_parameters(world, n) for n in names])
-    seen = model.predict(states, theta)
+    predicted = model.predict(states, theta)
     order = 1e-3 if law == "joint_tilt_compliance" else 0.0  # of two tilts in succession
-    moved = np.abs(seen.observation.position - world.ideal_readings(states).position).max()
+    moved = np.abs(predicted.observation.position - world.ideal_readings(states).position).max()
     rigid = Model(cell, ()).predict(states, np.zeros(0)).observation.position
-    size = np.abs(seen.observation.position - rigid).max()
+    size = np.abs(predicted.observation.position - rigid).max()
     assert moved <= order * size + 1e-11
     scale = np.array([p.scale for e in effects for p in e.parameters])
-    found = model.jacobian(seen, theta, 6)
+    found = model.jacobian(predicted, theta, 6)
     quotient = numeric_jacobian(model, states, theta, 1e-2 * scale, 6) / (1e-2 * scale)
     off = np.abs(found - quotient).max(axis=(0, 1)) * scale
     assert off.max() <= 1e-6 * (np.abs(quotient).max(axis=(0, 1)) * scale).max() + 1e-12
@@ -147,10 +147,14 @@ def test_shapes_of_turned_and_coupled_joints_are_those_of_the_drawn_arm():
     q = RNG.uniform(-2, 2, (5, 6))
     theta = drawn_angles(q)
     places, expected = body_poses(arm, q), body_poses(drawn, theta)
-    for mine, other in zip(capsules(arm), capsules(drawn), strict=True):
-        assert (mine.name, mine.body, mine.radius) == (other.name, other.body, other.radius)
-        for a, b in ((mine.start, other.start), (mine.end, other.end)):
-            here, there = places[:, mine.body] @ [*a, 1], expected[:, mine.body] @ [*b, 1]
+    for capsule, other in zip(capsules(arm), capsules(drawn), strict=True):
+        assert (capsule.name, capsule.body, capsule.radius) == (
+            other.name,
+            other.body,
+            other.radius,
+        )
+        for a, b in ((capsule.start, other.start), (capsule.end, other.end)):
+            here, there = places[:, capsule.body] @ [*a, 1], expected[:, capsule.body] @ [*b, 1]
             np.testing.assert_allclose(here, there, atol=1e-12)
     here, there = Scene(arm), Scene(drawn)
     for one, two in zip(q, theta, strict=True):

@@ -106,11 +106,11 @@ def test_a_cell_counts_from_what_the_configuration_says(tmp_path):
     (tmp_path / "x.yaml").write_text(UR5E_YAML)
     robot = {"model": "ur5e", "calibration": "x.yaml"}
     nominal = load_arm("ur5e")
-    told = cell_from_config(CellConfig.model_validate({"robot": robot}), tmp_path)
-    np.testing.assert_array_equal(told.arm.links, nominal.links)
+    cell = cell_from_config(CellConfig.model_validate({"robot": robot}), tmp_path)
+    np.testing.assert_array_equal(cell.arm.links, nominal.links)
     robot["kinematics"] = "factory"
     used = cell_from_config(CellConfig.model_validate({"robot": robot}), tmp_path)
-    assert flange_difference(used.arm, with_factory(nominal, told.factory))[1] == 0.0
+    assert flange_difference(used.arm, with_factory(nominal, cell.factory))[1] == 0.0
     kept = cell_from_config(CellConfig.model_validate({"robot": robot}), None, None, UR5E_YAML)
     np.testing.assert_array_equal(kept.arm.links, used.arm.links)
     del robot["calibration"]

@@ -232,9 +232,11 @@ def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(tmp_path, see
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
     assert path.verdict == "adequate"
     assert path.fit.model.named == ("base_frame", "joint_compliance", "guide_error")
-    told = [p for p in path.fit.parameters if p.name.startswith("guide_error") and p.identifiable]
-    assert len(told) > 20
-    off = np.array([(p.value - r.world.truth[p.name]) / p.std for p in told])
+    guide_errors = [
+        p for p in path.fit.parameters if p.name.startswith("guide_error") and p.identifiable
+    ]
+    assert len(guide_errors) > 20
+    off = np.array([(p.value - r.world.truth[p.name]) / p.std for p in guide_errors])
     # shrunk estimates of one family lie in their bands as often as normal numbers do
     assert np.sqrt(np.mean(off**2)) < 1.6
     assert np.abs(off).max() < 4.2

@@ -112,11 +112,11 @@ def test_whatever_is_free_is_free_by_another_way_to_count(name, thing, seed):
     coarse = 0.04 * arm.reach / 2  # the ends of the points' spacing
     for k, state in enumerate(q):
         at = frames(arm, state)
-        own = self_gap(capsules(arm), at)
+        gap_of_arm = self_gap(capsules(arm), at)
         far = min(gap_to(thing, placed(p, at)) - p.radius for p in capsules(arm) if p.body > 1)
-        assert own >= 0.01 - 1e-9 or itself[k]
+        assert gap_of_arm >= 0.01 - 1e-9 or itself[k]
         assert far >= 0.02 - 1e-9 or around[k]
-        assert own <= 0.01 + coarse or not itself[k]
+        assert gap_of_arm <= 0.01 + coarse or not itself[k]
         assert far <= 0.02 + coarse or not around[k]
 
 

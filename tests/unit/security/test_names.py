@@ -315,11 +315,11 @@ def test_terminal(name):
         assert harmless(file.getvalue())
         for markup in ("[red]", "[/]"):
             assert file.getvalue().count(markup) == 6 * name.count(markup)
-    with redirect_stderr(io.StringIO()) as told:
+    with redirect_stderr(io.StringIO()) as stderr:
         out = io.StringIO()
         Failures(True, WatchedStream(out), False).report(None, f"{name}: no such file", 2)
-    assert told.getvalue().count("\n") == 1
-    assert harmless(told.getvalue())
+    assert stderr.getvalue().count("\n") == 1
+    assert harmless(stderr.getvalue())
     assert harmless(json.loads(out.getvalue())["error"]["message"])
 
 

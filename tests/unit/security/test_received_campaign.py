@@ -79,9 +79,9 @@ def test_what_no_hilcal_wrote_is_refused(what, run, capsys):
         db.executescript(FOREIGN[what])
     before = run.read_bytes()
     for command in ("info", "identify", "diagnose"):
-        told = refused(capsys, 2, command, run)
-        assert str(run) in told
-        assert "hilcal" in told
+        refusal_text = refused(capsys, 2, command, run)
+        assert str(run) in refusal_text
+        assert "hilcal" in refusal_text
     assert run.read_bytes() == before
     assert list(run.parent.iterdir()) == [run]
 
@@ -90,10 +90,10 @@ def test_what_the_tables_hold_is_not_part_of_their_names(run):
     """A name of an object that would write on a terminal is told as it is spelled, if short."""
     with closing(sqlite3.connect(run)) as db:
         db.execute(f'CREATE TABLE "x\x1b[2J\ny{"long" * 9999}" (a)')
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as raised:
         CampaignFile.open(run)
-    assert str(told.value).isprintable()
-    assert len(str(told.value)) < 1000
+    assert str(raised.value).isprintable()
+    assert len(str(raised.value)) < 1000
 
 
 def journal_of_several_files(path, other):
@@ -113,22 +113,22 @@ def journal_of_several_files(path, other):
 
 
 def test_a_journal_beside_it_deletes_no_file(run, capsys):
-    mine = run.with_name("mine.txt")
-    mine.write_text("kept")
-    journal_of_several_files(run, mine)
+    user_file = run.with_name("mine.txt")
+    user_file.write_text("kept")
+    journal_of_several_files(run, user_file)
     for command in ("info", "identify", "repair"):
         assert "-journal: a journal that no hilcal made" in refused(capsys, 2, command, run)
-    assert mine.read_text() == "kept"
+    assert user_file.read_text() == "kept"
     with closing(sqlite3.connect(run)) as db:
         db.execute("SELECT * FROM meta")
-    assert not mine.exists(), "this SQLite would not have obeyed it"
+    assert not user_file.exists(), "this SQLite would not have obeyed it"
 
 
 def test_a_journal_that_is_a_link_leads_nowhere(run, capsys):
-    mine = run.with_name("mine.txt")
-    run.with_name(f"{run.name}-journal").symlink_to(mine)
+    user_file = run.with_name("mine.txt")
+    run.with_name(f"{run.name}-journal").symlink_to(user_file)
     assert "-journal: a journal that no hilcal made" in refused(capsys, 2, "identify", run)
-    assert not mine.exists()
+    assert not user_file.exists()
 
 
 @pytest.mark.parametrize("what", ["revisions", "meta", "readings", "poses", "events", "details"])
@@ -178,22 +178,22 @@ def test_no_robot_is_read_that_is_not_in_the_campaign(tmp_path, capsys):
     for name in (str(pipe), "../pipe.urdf", "/etc/hosts.urdf", "//server/share/x.urdf", "a.toml"):
         path = own_robot(tmp_path, name)
         for command in ("identify", "compare"):
-            told = refused(capsys, 2, command, path)
-            assert "hilcal repair" in told
-            assert "--robot" in told
+            refusal_text = refused(capsys, 2, command, path)
+            assert "hilcal repair" in refusal_text
+            assert "--robot" in refusal_text
         path.unlink()
 
 
 def test_the_user_gives_the_robot_of_an_old_campaign(tmp_path, capsys):
     path = own_robot(tmp_path, "own.urdf")
-    mine, other = tmp_path / "mine.urdf", tmp_path / "other.urdf"
-    mine.write_text(urdf(load_arm("ur10e")))
+    user_file, other = tmp_path / "mine.urdf", tmp_path / "other.urdf"
+    user_file.write_text(urdf(load_arm("ur10e")))
     other.write_text("<robot/>")
     before = path.read_bytes()
     refused(capsys, 2, "repair", path, "--robot", other)
     refused(capsys, 2, "repair", path, "--robot", tmp_path / "none.urdf")
     assert path.read_bytes() == before
-    told = ok(capsys, "repair", path, "--robot", mine, "--json").document
-    assert told["robot"] == str(mine)
+    document = ok(capsys, "repair", path, "--robot", user_file, "--json").document
+    assert document["robot"] == str(user_file)
     ok(capsys, "identify", path)
-    assert "already" in refused(capsys, 2, "repair", path, "--robot", mine)
+    assert "already" in refused(capsys, 2, "repair", path, "--robot", user_file)

@@ -122,9 +122,9 @@ def test_load_point_adds_the_moment_of_the_load():
     compliance = np.full(6, 1e-5)
     moved = rigid_world(joint_compliance=compliance, load_point=shift)
     cell = replace(CELL, load_point=CELL.load_point + shift)
-    told = replace(rigid_world(joint_compliance=compliance), cell=cell)
+    with_cell = replace(rigid_world(joint_compliance=compliance), cell=cell)
     np.testing.assert_allclose(
-        moved.ideal_readings(STATES).position, told.ideal_readings(STATES).position, atol=1e-14
+        moved.ideal_readings(STATES).position, with_cell.ideal_readings(STATES).position, atol=1e-14
     )
 
 
@@ -165,9 +165,11 @@ def test_unknown_registration_and_target_are_the_worlds_own():
     assert np.hypot(*world.registration[:2, 3]) == pytest.approx(3.0)
     np.testing.assert_allclose(world.registration[2, :3], [0, 0, 1], atol=1e-15)
     assert np.any(world.physics.target_offset != 0.0)
-    told = world_without_effect(ur10e_cell(registration_known=True), np.random.default_rng(1))
-    np.testing.assert_array_equal(told.registration, np.eye(4))
-    assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
+    known_world = world_without_effect(
+        ur10e_cell(registration_known=True), np.random.default_rng(1)
+    )
+    np.testing.assert_array_equal(known_world.registration, np.eye(4))
+    assert np.hypot(*known_world.station[:2, 3]) == pytest.approx(3.0)
 
 
 @refusals("hidden")
@@ -224,5 +226,5 @@ def test_the_world_shares_no_physics_with_the_program():
                 assert node.level == 0, name
                 names = [node.module]
             for module in names:
-                own = not module.startswith("hilcal") or module.startswith("hilcal.drivers.")
-                assert own or module in allowed, (name, module)
+                of_world = not module.startswith("hilcal") or module.startswith("hilcal.drivers.")
+                assert of_world or module in allowed, (name, module)

@@ -45,9 +45,9 @@ def test_loads_hang_for_seconds_or_minutes_and_never_since_before_the_last_readi
     assert np.all(hung[1:] < np.diff(states.time))
     decades = np.log(hung / 5.0) / np.log(60.0)  # uniform from 0 to 1, whatever hangs
     for which in range(3):
-        mine = decades[load == which]
-        assert mine.mean() == pytest.approx(0.5, abs=4.0 * np.sqrt(1 / 12 / len(mine)))
-        assert mine.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
+        of_load = decades[load == which]
+        assert of_load.mean() == pytest.approx(0.5, abs=4.0 * np.sqrt(1 / 12 / len(of_load)))
+        assert of_load.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
 
 
 def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
@@ -147,8 +147,10 @@ def test_sample_covariance_is_the_reported_one(m, known):
     value = world.observe(states, np.random.default_rng(5), m)
     off = value[:, :3] - sight.position
     if m == 6:
-        seen = Rotation.from_rotvec(value[:, 3:]) * Rotation.from_matrix(sight.rotation[0]).inv()
-        off = np.hstack([off, seen.as_rotvec()])
+        in_sight = (
+            Rotation.from_rotvec(value[:, 3:]) * Rotation.from_matrix(sight.rotation[0]).inv()
+        )
+        off = np.hstack([off, in_sight.as_rotvec()])
     white = np.linalg.solve(np.linalg.cholesky(cov), off.T)
     low, high = stats.chi2.ppf([0.001, 0.999], DRAWS * m)
     assert low < np.sum(white**2) < high

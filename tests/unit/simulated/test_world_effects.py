@@ -67,9 +67,9 @@ def test_the_flange_turns_by_the_moment_there_along_and_across_its_axis():
         moment = STATES.wrench[i, 3:] + np.cross(turn @ CELL.load_point, STATES.wrench[i, :3])
         moment = moment + np.cross(turn @ CELL.tool_com, CELL.tool_mass * CELL.gravity)
         expected = np.array([across, across, along]) * (turn.T @ moment)
-        seen = Rotation.from_matrix(turn.T @ rest.flange[i, :3, :3]).as_rotvec()
+        turn_vector = Rotation.from_matrix(turn.T @ rest.flange[i, :3, :3]).as_rotvec()
         second = expected @ expected  # three successive turns are no rotation vector
-        np.testing.assert_allclose(seen, expected, rtol=1e-4, atol=second)
+        np.testing.assert_allclose(turn_vector, expected, rtol=1e-4, atol=second)
         np.testing.assert_allclose(rest.flange[i, :3, 3], stiff[:3, 3], atol=1e-13)
 
 
@@ -77,8 +77,8 @@ def test_periodic_compliance_goes_twice_round_with_the_commanded_angle():
     ab = 1e-11 * np.random.default_rng(0).normal(size=(6, 2))
     torque = rigid_torques(STATES)
     give = ab[:, 0] * np.cos(2 * STATES.q) + ab[:, 1] * np.sin(2 * STATES.q)
-    seen = drive_angles(world(periodic_joint_compliance=ab), STATES)
-    np.testing.assert_allclose(seen, torque * give, rtol=1e-5, atol=1e-15)
+    deflection = drive_angles(world(periodic_joint_compliance=ab), STATES)
+    np.testing.assert_allclose(deflection, torque * give, rtol=1e-5, atol=1e-15)
     # where all stand at one angle it is a plain compliance, also where that is no small one
     same = replace(STATES, q=np.full_like(STATES.q, 0.4))
     big = np.column_stack([3.0 * JOINT, -2.0 * JOINT])
@@ -89,11 +89,11 @@ def test_periodic_compliance_goes_twice_round_with_the_commanded_angle():
 def test_play_is_crossed_with_the_sign_of_the_torque():
     b = 1e-9 * np.arange(1.0, 7.0)
     torque, tenth = rigid_torques(STATES), 0.01 * ARM.torque_max
-    seen = drive_angles(world(backlash=b), STATES)
-    np.testing.assert_allclose(seen, b * np.tanh(torque / tenth), rtol=1e-5, atol=1e-15)
+    deflection = drive_angles(world(backlash=b), STATES)
+    np.testing.assert_allclose(deflection, b * np.tanh(torque / tenth), rtol=1e-5, atol=1e-15)
     far = np.abs(torque) > 10.0 * tenth
     assert 0.2 < far.mean() < 1.0
-    np.testing.assert_allclose(seen[far], (b * np.sign(torque))[far], rtol=1e-7)
+    np.testing.assert_allclose(deflection[far], (b * np.sign(torque))[far], rtol=1e-7)
 
 
 def test_creep_softens_the_drives_by_decades_of_the_time_under_load():
@@ -110,13 +110,13 @@ def test_links_grow_with_the_temperature_of_the_air():
     alpha, count = 2e-4, len(STATES)
     states = replace(STATES, air_temperature=np.linspace(10.0, 40.0, count))
     grown = world(**SOFT, thermal_growth=np.array([alpha]))
-    seen = grown.ideal_readings(states)
+    grown_readings = grown.ideal_readings(states)
     for i in range(0, count, 5):
         links = ARM.links.copy()
         links[:, :3, 3] *= 1.0 + alpha * (states.air_temperature[i] - 20.0)
         long = world(cell_with(links=links), **SOFT).ideal_readings(states[i : i + 1])
-        np.testing.assert_allclose(seen.position[i], long.position[0], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(seen.jacobian[i], long.jacobian[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(grown_readings.position[i], long.position[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(grown_readings.jacobian[i], long.jacobian[0], rtol=0, atol=1e-12)
     rigid = world(thermal_growth=np.array([alpha])).equilibrium(states).flange
     stiff = np.array([frames(ARM, q)[2] for q in states.q])
     factor = 1.0 + alpha * (states.air_temperature - 20.0)
@@ -155,8 +155,10 @@ def acting(flange, said, *, bias=0.0, gain=0.0, turn=(0.0, 0.0, 0.0)):
     for i, wrench in enumerate(said):
         if np.any(wrench):
             R = flange[i, :3, :3]
-            own = (np.concatenate([R.T @ wrench[:3], R.T @ wrench[3:]]) - bias) / (1.0 + gain)
-            out[i] = np.concatenate([R @ axes @ own[:3], R @ axes @ own[3:]])
+            in_flange_axes = (np.concatenate([R.T @ wrench[:3], R.T @ wrench[3:]]) - bias) / (
+                1.0 + gain
+            )
+            out[i] = np.concatenate([R @ axes @ in_flange_axes[:3], R @ axes @ in_flange_axes[3:]])
     return out
 
 

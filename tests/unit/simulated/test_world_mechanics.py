@@ -131,8 +131,8 @@ def test_a_long_link_bends_as_a_cantilever(force):
     ])  # fmt: skip
     # over 1 µm and 1 µrad the next order is 1e-6 of the first
     np.testing.assert_allclose(rest.flange[0, :3, 3], [0.8, y, z], atol=1e-5 * (abs(y) + abs(z)))
-    seen = Rotation.from_matrix(rest.flange[0, :3, :3]).as_rotvec()
-    np.testing.assert_allclose(seen, about, rtol=1e-4)
+    turn_vector = Rotation.from_matrix(rest.flange[0, :3, :3]).as_rotvec()
+    np.testing.assert_allclose(turn_vector, about, rtol=1e-4)
 
 
 def test_jacobian_is_the_derivative_of_the_flange():

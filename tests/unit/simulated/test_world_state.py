@@ -90,10 +90,10 @@ def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_p
 def test_the_published_scatter_of_arrivals_is_that_of_the_joints(tmp_path):
     cell = running_world(tmp_path, joint_std=3e-5)
     count = 400
-    seen = np.array([cell.rest_at(Q)["target"] for _ in range(count)])
+    targets = np.array([cell.rest_at(Q)["target"] for _ in range(count)])
     sight = cell.world.ideal_readings(states(Q, np.zeros(6), 0.0))
     jac = sight.jacobian[0, :3] * cell.world.joint_std
-    white = np.linalg.solve(np.linalg.cholesky(jac @ jac.T), (seen - sight.position).T)
+    white = np.linalg.solve(np.linalg.cholesky(jac @ jac.T), (targets - sight.position).T)
     # |white|² is chi-square of 3 degrees: mean 3, variance 6
     assert abs(np.mean(np.sum(white**2, axis=0)) - 3.0) < 5.0 * np.sqrt(6.0 / count)
     assert np.abs(white.mean(axis=1)).max() < 5.0 / np.sqrt(count)
@@ -220,9 +220,9 @@ def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
     cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
     cell.living.hang("5kg")
     still = cell.world.equilibrium(states(Q, WEIGHT, 0.0), slip_of(cell)).flange[0]
-    seen = [cell.truth_after()["flange"] for _ in range(2)]
-    assert not same_bytes(seen[0], still)
-    assert not same_bytes(seen[0], seen[1])
+    flanges = [cell.truth_after()["flange"] for _ in range(2)]
+    assert not same_bytes(flanges[0], still)
+    assert not same_bytes(flanges[0], flanges[1])
     time.sleep(0.2)  # 4 s of the world, 20 decays
     assert same_bytes(cell.truth_after()["flange"], still)
 
@@ -248,9 +248,9 @@ def test_every_effect_shows_in_the_truth(tmp_path):
     for effect in remaining_effects(3):
         gone = np.zeros_like(getattr(cell.world.physics, effect))
         less = replace(cell.world, physics=cell.world.physics.with_effect(effect, gone))
-        seen = less.ideal_readings(state_of(cell, truth, PULL), slip_of(cell)).position[0]
+        position = less.ideal_readings(state_of(cell, truth, PULL), slip_of(cell)).position[0]
         # Creep has only begun; equilibria are exact to 1e-12 rad.
-        assert np.linalg.norm(seen - truth["target"]) > 1e-9, effect
+        assert np.linalg.norm(position - truth["target"]) > 1e-9, effect
 
 
 SLOW = {
@@ -285,9 +285,9 @@ def test_a_sensor_that_misreads_says_what_hangs_while_the_arm_bears_another_load
         cell.living.hang("5kg")
     a, b = (cell.board.read("truth") for cell in (wrong, right))
     turned = a["flange"][:3, :3]
-    seen = Rotation.from_matrix(turned.T @ b["flange"][:3, :3]).magnitude()
-    assert 1e-6 < seen < 1e-3
-    np.testing.assert_allclose(a["sensor_wrench"], b["sensor_wrench"], atol=60.0 * seen)
+    turn = Rotation.from_matrix(turned.T @ b["flange"][:3, :3]).magnitude()
+    assert 1e-6 < turn < 1e-3
+    np.testing.assert_allclose(a["sensor_wrench"], b["sensor_wrench"], atol=60.0 * turn)
     lean = np.abs(a["drive_torque"] - b["drive_torque"])
     assert lean[1] > 1.0
     assert wrong.living.hang(None) is None
@@ -300,8 +300,8 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     world = world_of(made, **every_effect(np.random.default_rng(3)), **remaining_effects(4))
     world = replace(world, joint_reference=23.4)
     write_world(tmp_path / "world.json", world, made)
-    back, told = read_world(tmp_path / "world.json")
-    assert told == made
+    back, stored = read_world(tmp_path / "world.json")
+    assert stored == made
     assert back.truth == world.truth
     assert back.noise == world.noise
     for name in ("registration", "station", "joint_std"):

@@ -60,15 +60,15 @@ def in_memory(stream, found):
 
 
 def test_parameters_are_those_of_the_fit_in_memory(found, in_memory):
-    seen = found.identifiable
+    identifiable = found.identifiable
     assert not found.outliers
-    assert np.array_equal(seen, in_memory.uncertainty.identifiable)
-    assert np.abs(found.theta[seen] / in_memory.theta[seen] - 1).max() < 1e-9
+    assert np.array_equal(identifiable, in_memory.uncertainty.identifiable)
+    assert np.abs(found.theta[identifiable] / in_memory.theta[identifiable] - 1).max() < 1e-9
     assert found.chi2 == pytest.approx(in_memory.chi2, rel=1e-9)
     assert (found.dof, found.rank) == (pytest.approx(in_memory.dof), in_memory.rank)
     assert not found.inflated
-    formal = in_memory.uncertainty.formal[seen]
-    assert found.std[seen] == pytest.approx(formal, rel=1e-6)
+    formal = in_memory.uncertainty.formal[identifiable]
+    assert found.std[identifiable] == pytest.approx(formal, rel=1e-6)
     assert found.condition == pytest.approx(
         (
             in_memory.solution.equations.basis.condition_unscaled,
@@ -129,11 +129,11 @@ def test_nearly_dependent_columns_lose_no_digits():
 def test_identify_takes_a_stream_and_writes_a_calibration(capsys, tmp_path):
     path, out = tmp_path / "gross.parquet", tmp_path / "cal.json"
     truth = write(path, COUNT, group=GROUP, gross=GROSS)
-    told = ok(
+    result = ok(
         capsys, "identify", path, "--cell", CELL, "--effects", ",".join(EFFECTS),
         "-o", out, "--workers", "1", "--json",
     )  # fmt: skip
-    document = told.document
+    document = result.document
     assert (document["n_readings"], document["n_outliers"]) == (COUNT, GROSS)
     assert sorted(o["row"] for o in document["outliers"]) == [8, 9, 10, 11]
     assert document["error"]["fit"]["max_m"] == pytest.approx(5e-3 * np.sqrt(3), abs=5 * NOISE)
@@ -146,7 +146,7 @@ def test_identify_takes_a_stream_and_writes_a_calibration(capsys, tmp_path):
     fixed = calibration.compensate(states.q, states.wrench)
     assert fixed.after.error_m.max() < 1e-9
     assert fixed.inside.all()
-    assert f"Fitted to {COUNT} absolute readings" in told.err
+    assert f"Fitted to {COUNT} absolute readings" in result.err
 
 
 def nan_at(table):
@@ -180,5 +180,5 @@ def test_interrupted_and_damaged_files_are_refused(tmp_path):
 
 def test_options_of_a_stream_are_not_of_a_campaign(capsys, stream):
     assert "--cell" in refused(capsys, 2, "identify", stream)
-    told = refused(capsys, 2, "identify", stream, "--cell", CELL, "--scaling", "none")
-    assert "scaling is gc" in told
+    refusal_text = refused(capsys, 2, "identify", stream, "--cell", CELL, "--scaling", "none")
+    assert "scaling is gc" in refusal_text

@@ -252,8 +252,8 @@ def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(tmp
     found = {(r["entrant"], r["task"]): r["law_equivalent"] for r in document["tasks"]}
     assert [found["some", f.name] for f in (first, second)] == [1.0, 0.0]
     assert [found["none", f.name] for f in (first, second)] == [None, None]
-    own = next(e for e in document["groups"][0]["entrants"] if e["entrant"] == "some")
-    assert own["law_equivalent"]["value"] == 0.5
+    entrant = next(e for e in document["groups"][0]["entrants"] if e["entrant"] == "some")
+    assert entrant["law_equivalent"]["value"] == 0.5
 
 
 @pytest.mark.parametrize("track", first(1, ["law", "elastic", "mujoco"]))
@@ -277,8 +277,8 @@ def test_a_key_makes_the_same_bytes_and_another_key_other_tasks(track):
     one, other = make(secret[0], "private", "k1"), make(secret[0], "private", "k2")
     assert one == make(secret[0], "private", "k1")
     assert len({text["train.csv"] for text in (one, other, first)}) == 3
-    told, secrets = json.loads(one["task.json"]), json.loads(one["truth.json"])
-    assert told.keys() == json.loads(first["task.json"]).keys()
+    task, secrets = json.loads(one["task.json"]), json.loads(one["truth.json"])
+    assert task.keys() == json.loads(first["task.json"]).keys()
     assert secrets["part"] == "private"
     assert "private" not in "".join(one[n] for n in ("task.json", "train.csv", "test.csv"))
 

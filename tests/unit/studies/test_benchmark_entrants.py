@@ -131,12 +131,14 @@ def test_what_was_run_is_not_run_again(tmp_path, fakes):
     assert run(tmp_path, *words, home=fakes) == 0
     (fakes / "good" / "entrant.py").write_text("raise SystemExit(1)")
     assert run(tmp_path, str(TASKS), "--score", home=fakes) == 0
-    kept_in, told = tmp_path / "kept.json", tmp_path / "page.md"
-    assert run(tmp_path, *words, "--keep", str(kept_in), "--page", str(told), home=fakes) == 0
+    kept_in, report_page = tmp_path / "kept.json", tmp_path / "page.md"
+    assert (
+        run(tmp_path, *words, "--keep", str(kept_in), "--page", str(report_page), home=fakes) == 0
+    )
     date, rows = kept(kept_in)
     failed = {r["entrant"]: r["failed"] for r in rows}
     assert failed == {"good": None, "cannot": "not run: needs Julia"}
-    assert told.read_text() == page(date, rows, fakes)
+    assert report_page.read_text() == page(date, rows, fakes)
 
 
 @pytest.mark.parametrize(

@@ -54,8 +54,8 @@ def test_two_mechanics_agree_to_a_micrometre(robot):
             cell.gravity, {**always, **effects}, world.registration,
         )  # fmt: skip
         q, wrench = c.states.q, c.states.wrench
-        seen = replace(world, physics=physics).ideal_readings(c.states).position
-        return seen, arm.read(q, wrench, np.asarray(c.states.time))
+        position = replace(world, physics=physics).ideal_readings(c.states).position
+        return position, arm.read(q, wrench, np.asarray(c.states.time))
 
     bare_one, bare_other = both({})
     np.testing.assert_allclose(bare_one, bare_other, atol=1e-11)

@@ -98,8 +98,8 @@ def test_refinements_count_where_the_effect_was_found_and_named():
     assert (row.right.hits, row.right.cases) == (1, 2)
     assert (row.holdout.hits, row.holdout.cases) == (1, 2)
     assert (row.intervals.hits, row.intervals.cases) == (5, 7)
-    told = dict(coverage_by_effect([right, more, wrong]))
-    assert told["joint_compliance"].share == pytest.approx(4 / 6)
+    coverage = dict(coverage_by_effect([right, more, wrong]))
+    assert coverage["joint_compliance"].share == pytest.approx(4 / 6)
 
 
 def test_outside_of_the_catalogue_the_verdict_and_the_variable_count():

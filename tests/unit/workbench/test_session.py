@@ -189,11 +189,16 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run, session, snaps
 def test_the_readings_that_were_picked_are_told_apart(run, session, snapshot):
     story = snapshot.story
     pulled = np.flatnonzero(np.array(story.load_names) == "pull y")
-    told = {d.variable: d for d in session.differences(snapshot, pulled)}
-    mine = told["load pull y"]
-    assert (mine.picked, mine.others, mine.larger, mine.clear) == (1.0, 0.0, 1.0, True)
+    by_variable = {d.variable: d for d in session.differences(snapshot, pulled)}
+    difference = by_variable["load pull y"]
+    assert (difference.picked, difference.others, difference.larger, difference.clear) == (
+        1.0,
+        0.0,
+        1.0,
+        True,
+    )
     reach = session.recorded(snapshot)["distance from the base axis"].values
     far = np.flatnonzero(reach > np.median(reach))
-    told = {d.variable: d for d in session.differences(snapshot, far)}
-    assert told["distance from the base axis"].larger == 1.0
+    by_variable = {d.variable: d for d in session.differences(snapshot, far)}
+    assert by_variable["distance from the base axis"].larger == 1.0
     assert session.differences(snapshot, np.arange(len(story))) == ()  # no others

@@ -37,18 +37,18 @@ def test_progress_and_failures_are_lines():
         return work.failure()
 
     assert fails(InputError("no such file")) == "no such file"
-    told = fails(ZeroDivisionError("by\nzero"))
-    assert told == "unexpected ZeroDivisionError: by zero; please report it"
+    refusal_text = fails(ZeroDivisionError("by\nzero"))
+    assert refusal_text == "unexpected ZeroDivisionError: by zero; please report it"
 
-    work, seen, go = Work(), threading.Event(), threading.Event()
+    work, started, go = Work(), threading.Event(), threading.Event()
 
     def says(say):
         say("diagnosing")
-        seen.set()
+        started.set()
         go.wait(10)
 
     work.start("Adding creep", says)
-    assert seen.wait(10)
+    assert started.wait(10)
     assert work.line == "Adding creep: diagnosing"
     go.set()
 
