@@ -74,6 +74,8 @@ def _check_outputs(output: Path, csv: Path | None, record: Path | None) -> None:
 
 
 @command(f"""
+    poses | --poses | Number of poses, default {POSES}; each is read unloaded and under every load
+        that is possible there.
     readings | --readings | Number of readings, repeats not counted, instead of --poses: poses and
         loads are chosen by their information.
     criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
@@ -82,7 +84,7 @@ def _check_outputs(output: Path, csv: Path | None, record: Path | None) -> None:
         --until; a drift then costs more information.
     """)
 def plan(
-    t: Terminal, catalogue: Catalogue, cell: Path, output: Path, poses: int = POSES,
+    t: Terminal, catalogue: Catalogue, cell: Path, output: Path, poses: int | None = None,
     readings: int | None = None, criterion: str | None = None, after: Path | None = None,
     revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR, seed: int = 0,
     unloaded_first: bool = False, quick: bool = False, csv: Path | None = None,
@@ -99,7 +101,10 @@ def plan(
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and criterion_name(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
-    request = PlanRequest(poses, readings, criterion, unloaded=unloaded)
+    if poses is not None and readings is not None:
+        raise InputError("--poses and --readings are two sizes of a plan; give one of them")
+    size = POSES if poses is None else poses
+    request = PlanRequest(size, readings, criterion, unloaded=unloaded)
     with working(t.progress) as say:
         fitted, reference, appendable = None, None, False
         if after is not None:

@@ -364,7 +364,7 @@ class Planning(CellSection):
     work_load: the name of one of [[loads]], or "none", under which it will work | "5kg"
     reading_s: how long a reading takes in s, over 0; from [acquire] if absent | 8.0
     load_change_s: how long a person needs for a change of the load in s, over 0
-    candidates: how many poses to choose from, a whole number, 1 to 1000000
+    candidates: how many poses to choose from, a whole number, 2 to 1000000
     singularity: the least ratio of the smallest to the largest singular value of the flange's
         Jacobian, lengths in units of the reach, 0 or more, below 1
     """
@@ -382,7 +382,7 @@ class Planning(CellSection):
     work_load: _Name = "none"
     reading_s: Positive | None = None
     load_change_s: Positive = 60.0
-    candidates: Annotated[Whole, Field(le=1_000_000)] = 2000
+    candidates: Annotated[Whole, Field(ge=2, le=1_000_000)] = 2000
     singularity: Annotated[float, Strict(), Field(ge=0, lt=1)] = 0.05
 
     @model_validator(mode="after")

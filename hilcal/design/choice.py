@@ -263,8 +263,9 @@ def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPos
         rows [A', Z H^−½ Q] whitened by 1 + T Tᵀ,    T = Z H^−½ (1 − Q Qᵀ)
 
     The criterion is 1 / tr(C M⁻¹), C the mean of VᵀV, V the derivative of predicted positions by
-    the coordinates (b, Qᵀ v). Source: Chaloner and Verdinelli, *Bayesian experimental design: a
-    review*, Statistical Science 10 (1995) 273-304.
+    the coordinates (b, Qᵀ v). Its `rest` is the mean variance of predictions by the other
+    directions, of which nothing is learnt. Source: Chaloner and Verdinelli, *Bayesian experimental
+    design: a review*, Statistical Science 10 (1995) 273-304.
     """
     nominal = problem.nominal
     if not np.any(config.repeatability.per_joint(nominal.cell.arm.n)):  # not stated
@@ -288,14 +289,17 @@ def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPos
     rows = np.zeros((*problem.units.rows.shape[:2], count))
     for members, part in all_rows():
         rows[members, : part.shape[1]] = coordinates.whitened(part)
-    v = coordinates.columns(position_derivative(nominal, work, effects, scale)).reshape(-1, count)
+    moved = position_derivative(nominal, work, effects, scale)
+    v = coordinates.columns(moved).reshape(-1, count)
     prior = np.eye(count)
     prior[: coordinates.flat.shape[1], : coordinates.flat.shape[1]] = coordinates.prior
     names = [t.name for t, free in zip(problem.terms, flat, strict=False) if free]
     names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
+    every, retained = (np.sum((moved @ r) ** 2) for r in (coordinates.root, coordinates.random))
+    rest = float(max(every - retained, 0.0)) / len(work.q)
     units = CandidateSet(rows, problem.units.cost)
-    return Objective(units, MeanVariance(c), prior, tuple(names))
+    return Objective(units, MeanVariance(c, rest=rest), prior, tuple(names))
 
 
 def balanced(design: Objective) -> Objective:
@@ -318,7 +322,8 @@ def balanced(design: Objective) -> Objective:
     turned = CandidateSet(units.rows @ turn, units.cost)
     names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
     prior, c = (turn.T @ m @ turn for m in (design.prior, criterion.c))
-    return Objective(turned, MeanVariance(0.5 * (c + c.T)), 0.5 * (prior + prior.T), names)
+    turned_c = replace(criterion, c=0.5 * (c + c.T))
+    return Objective(turned, turned_c, 0.5 * (prior + prior.T), names)
 
 
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:

@@ -98,6 +98,12 @@ class MeanVariance(SmoothCriterion):
     c: Floats  # (P, P) C, positive semidefinite
     name: str = "I"
     model: Floats | None = None  # (s, s) C_s of the first parameters; None: no second term
+    rest: float = 0.0  # mean variance beside tr(C M⁻¹) that no unit lowers; not in φ
+
+    def std(self, m: Floats) -> float:
+        """Return the RMS standard uncertainty at M (P, P), with `rest`; infinite where singular."""
+        value = float(self.value(m))
+        return float(np.sqrt(1.0 / value + self.rest)) if value > 0.0 else float(np.inf)
 
     @cached_property
     def roots(self) -> tuple[Floats, ...]:

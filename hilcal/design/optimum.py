@@ -68,8 +68,8 @@ def best_design(
         determined = False
     if not determined:
         raise CannotAnswerError(
-            f"a budget of {budget:g} takes {int(counts.sum())} units, too few to determine "
-            f"{units.size} parameters by criterion {criterion.name}; raise the budget"
+            f"{budget:g} readings or poses are too few to determine all parameters, as criterion "
+            f"{criterion.name} needs; ask for more"
         )
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
 

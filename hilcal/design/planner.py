@@ -11,6 +11,7 @@ from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
+from hilcal.design.criteria import MeanVariance
 from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.feasible import DrawnPoses, FeasibleSpace, draw_poses
 from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
@@ -167,6 +168,17 @@ class Planned:
         out[np.flatnonzero(self.usable)] = self.design.counts
         return out
 
+    def all_effects_std(self, information: Floats) -> float | None:
+        """Return the RMS standard uncertainty of predictions at an information (P, P), m.
+
+        Every effect of the catalogue is unknown, each as large as arms have it or as the readings
+        so far tell it; None where the plan is not made by criterion I.
+        """
+        criterion = self.objective.criterion
+        if self.criterion != "I" or not isinstance(criterion, MeanVariance):
+            return None
+        return criterion.std(information)
+
 
 def plan_readings(
     cell: Cell,
@@ -196,6 +208,8 @@ def plan_readings(
     count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
     if count < 1:
         raise InputError(f"{count} {unit}; valid: a whole number from 1")
+    if not cell.registration_known and fit is None and count + 1 < MIN_POSES:
+        raise _too_few_poses(count + 1, unit)
     budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
     limits.check_planned(f"{count} {unit}", "readings", int(budget))
     objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
@@ -242,10 +256,7 @@ def plan_readings(
         design = choice.certified_design(objective, counts, usable, relaxed)
     visited = len({reduced.contents[k][0] for k in units}) + 1
     if not cell.registration_known and fit is None and visited < MIN_POSES:
-        raise CannotAnswerError(
-            f"the plan has {visited} poses, the reference among them; an unknown registration "
-            f"needs at least {MIN_POSES}: ask for more {unit}"
-        )
+        raise _too_few_poses(visited, unit)
     say("ordering the readings")
     repeats = max(2, (visited - 1) // 10)
     sampled, nominal = reduced.candidates[slice(0, SAMPLE)].states(), reduced.nominal
@@ -258,6 +269,13 @@ def plan_readings(
         order, design, costly, reduced, objective, usable, work, drawn, budget, criterion,
         precision, undetermined, request.poses if by_poses else None,
     )  # fmt: skip
+
+
+def _too_few_poses(visited: int, unit: str) -> CannotAnswerError:
+    return CannotAnswerError(
+        f"the plan has {visited} poses, the reference among them; an unknown registration needs at "
+        f"least {MIN_POSES}: ask for more {unit}"
+    )
 
 
 def _reference(

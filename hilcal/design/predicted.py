@@ -94,6 +94,13 @@ def _poses(
                 f"[planning] work_q_rad has joint vectors of {q.shape[1]} values; {cell.arm.name} "
                 f"has {n} joints"
             )
+        outside = np.argwhere((q < cell.arm.q_min) | (q > cell.arm.q_max))
+        for row, j in outside[:1]:
+            low, high, unit = cell.arm.q_min[j], cell.arm.q_max[j], cell.arm.units[j]
+            raise InputError(
+                f"[planning] work_q_rad, vector {row + 1}: joint {j + 1} is at {q[row, j]:g} "
+                f"{unit}; its range is {low:.4g} to {high:.4g} {unit}"
+            )
         return q, f"at {len(q)} named poses"
     rng = np.random.default_rng(_SEED)
     if planning.work_min_m is None or planning.work_max_m is None:

@@ -42,6 +42,7 @@ _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
 }
+RANDOM_PLANS = 9  # random plans, of which the median is given; a choice
 DRAWS = 5  # random directions of an effect, over which the strength's median is taken; a choice
 _SEED = 20240611
 
@@ -114,11 +115,13 @@ class CurvePoint:
         poses: number of poses without the reference.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
         efficiency: certified efficiency with this number of poses; None without.
+        all_effects_std_m: as of `PlanSummary`.
     """
 
     poses: int
     position_std_m: float
     efficiency: float | None = None
+    all_effects_std_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +147,10 @@ class PlanSummary(Brief):
     shortest: Confounding | None = None  # confounding of the shortest order
     remarks: tuple[str, ...] = ()  # assumptions and omissions, one sentence each
     asked_poses: int | None = None  # requested number of poses; None if readings were requested
+    # as `position_std_m`, with every effect of the catalogue unknown and as large as arms have it,
+    # or as the readings so far tell it; None by other criteria than I
+    all_effects_std_m: float | None = None
+    random_std_m: float | None = None  # the same of as many poses drawn at random, median
 
     @property
     def quantity(self) -> str:
@@ -176,6 +183,7 @@ class PlanSummary(Brief):
         return {
             **{key: fields[key] for key in keys}, "asked_poses": self.asked_poses,
             "position": self.position, "position_note": self.position_note,
+            "all_effects_std_m": self.all_effects_std_m, "random_std_m": self.random_std_m,
             "predicted_std": {p.name: p.std for p in self.parameters},
             "readings_by_load": self.loads, "criteria": fields["criteria"],
             "curve": fields["curve"], "detectable": fields["detectable"], "order": order,
@@ -203,10 +211,12 @@ def summarise(
         efficiency=planned.design.efficiency, parameters=_parameters(planned),
         position_std_m=_finite(precision.position), position=planned.work.description,
         criteria=tuple(_criteria(planned, config, rng)) if compare else (),
-        curve=tuple(_curve(planned)) if curve else (),
+        curve=tuple(_curve(planned, rng)) if curve else (),
         detectable=tuple(detectable_effects(planned, config)), longer=planned.ordered.longer,
         confounding=planned.ordered.confounding, shortest=planned.ordered.confounding_shortest,
         remarks=remarks(planned), asked_poses=planned.asked_poses,
+        all_effects_std_m=_finite(planned.all_effects_std(planned.design.information)),
+        random_std_m=_random_std(planned, rng),
     )  # fmt: skip
 
 
@@ -242,17 +252,12 @@ def remarks(planned: Planned) -> tuple[str, ...]:
     )
     readings, efficiency = int(planned.design.cost), planned.design.efficiency
     suboptimal = planned.asked_poses is not None and efficiency < NOTABLE_EFFICIENCY
-    if planned.criterion == "I":
-        std = 1e6 / np.sqrt(planned.design.value)
-        quantity = planned.work.description.split(" ")[0]
-        best = (
-            f"; the same number of readings at the most informative poses and loads (--readings "
-            f"{readings}) would reach {std * np.sqrt(efficiency):.3g} µm at best"
-        )
-        omitted += (
-            f"with every effect of the catalogue at its usual size on arms, the {quantity} is "
-            f"predicted to {std:.3g} µm (rms){best if suboptimal else ''}",
-        )
+    if planned.criterion == "I":  # no plan comes near the bound, which splits single readings
+        if len(planned.problem.candidates.loads) > 1 and planned.asked_poses is not None:
+            omitted += (
+                "many poses without a load can tell more than few poses under every load: "
+                f"--readings {readings} chooses among both",
+            )
     elif suboptimal:
         omitted += (
             f"the same number of readings at the most informative poses and loads (--readings "
@@ -335,7 +340,35 @@ def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
     return tuple(f"{e.name}." for e in problem.nominal.model.effects if e.role in roles)
 
 
-def _curve(planned: Planned) -> Iterator[CurvePoint]:
+def _random_std(planned: Planned, rng: np.random.Generator) -> float | None:
+    """Return the median `all_effects_std` of random plans of as many poses; None without."""
+    objective, count = planned.objective, planned.asked_poses
+    if count is None or planned.all_effects_std(objective.prior) is None:
+        return None
+    poses = pose_units(objective, planned.problem)
+    usable = {planned.problem.contents[k][0] for k in np.flatnonzero(planned.usable)}
+    among = np.flatnonzero(np.isin(poses.poses, [*usable]))
+    if len(among) < count:
+        return None
+    drawn = (rng.permutation(among)[:count] for _ in range(RANDOM_PLANS))
+    units, one = poses.units, np.ones(count)
+    stds = [planned.all_effects_std(objective.prior + units.information(one, k)) for k in drawn]
+    return _finite(float(np.median([std for std in stds if std is not None])))
+
+
+def _resized(planned: Planned, poses: int, budget: float, rng: np.random.Generator) -> Floats:
+    """Return the counts (K,) of a plan by criterion I of another size."""
+    problem, objective, usable = planned.problem, planned.objective, planned.usable
+    if planned.asked_poses is not None:
+        candidates = pose_units(objective, problem)
+        among = np.isin(candidates.poses, [problem.contents[k][0] for k in np.flatnonzero(usable)])
+        return choose_poses(objective, candidates, among, poses, rng, 1)[0].astype(float)
+    counts = np.zeros(len(usable))
+    counts[usable] = best_design(objective.among(usable), budget, rng, effort=1).counts
+    return counts
+
+
+def _curve(planned: Planned, rng: np.random.Generator) -> Iterator[CurvePoint]:
     problem = planned.problem
     objective, usable = planned.objective.among(planned.usable), np.flatnonzero(planned.usable)
     n_poses = len({problem.contents[k][0] for k in np.flatnonzero(planned.counts)})
@@ -344,14 +377,22 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         budget, poses = share * planned.budget, max(1, round(share * n_poses))
         if budget < objective.units.cost.max() or poses == previous:
             continue
-        previous = poses
-        last = relax(objective, budget, tolerance=COARSE_GAP, start=last)
-        information = problem.prior + problem.units.information(last.weight, usable[last.index])
+        previous, std = poses, None
+        if planned.criterion == "I":  # the continuous optimum splits single readings
+            try:
+                counts = planned.counts if share == 1.0 else _resized(planned, poses, budget, rng)
+            except CannotAnswerError:
+                continue
+            std = planned.all_effects_std(planned.objective.information(counts))
+            information = problem.prior + problem.units.information(counts)
+        else:
+            last = relax(objective, budget, tolerance=COARSE_GAP, start=last)
+            information = problem.prior + problem.units.information(last.weight, usable[last.index])
         position = _finite(
             predicted_uncertainty(problem, information=information, work=planned.work).position
         )
         if position is not None:
-            yield CurvePoint(poses, position)
+            yield CurvePoint(poses, position, all_effects_std_m=_finite(std))
 
 
 def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:

@@ -7,7 +7,12 @@ from pathlib import Path
 from hilcal import numbers
 from hilcal.design.next import SEPARATED_POWER, PairPower, SeparatingPlan
 from hilcal.design.run_order import Confounding
-from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
+from hilcal.design.summary import (
+    NOTABLE_EFFICIENCY,
+    CurvePoint,
+    PlanSummary,
+    PredictedParameter,
+)
 from hilcal.names import quoted
 from hilcal.numbers import digits, length
 from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
@@ -37,7 +42,7 @@ def plan_facts(s: PlanSummary) -> Iterator[Block]:
     """Yield costs and predicted uncertainty of a plan, and of plans with more poses."""
     yield from (heading("Plan"), pairs(cost_rows(s)), "")
     if larger := [c for c in s.curve if c.poses > s.poses]:
-        larger_plans = [f"{c.poses} poses ± {length(c.position_std_m)}" for c in larger[::2]]
+        larger_plans = [f"{c.poses} poses ± {length(_std(c))}" for c in larger[::2]]
         yield f"More would give, predicted for the {s.quantity}: {', '.join(larger_plans)}."
 
 
@@ -119,7 +124,7 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     """Yield names and values of the costs and predicted results of a plan."""
     fewer = ""
     if s.asked_poses not in (None, s.poses):
-        fewer = f": the cell leaves no more of {s.asked_poses}; some are read again"
+        fewer = f": the candidates leave no more of {s.asked_poses}; some are read again"
     yield "poses", f"{s.poses} and the reference{fewer}"
     loads = ", ".join(f"{load_name(name)} {count}" for name, count in s.loads.items())
     yield "readings", f"{s.readings}: {loads}"
@@ -132,9 +137,33 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     yield "criterion", f"{s.criterion}: {meaning}" if meaning else s.criterion
     if s.efficiency is not None:
         yield "efficiency", efficiency_sentence(s.efficiency)
-    if s.position_std_m is not None:
+        if s.all_effects_std_m is not None and s.efficiency < NOTABLE_EFFICIENCY:
+            yield "", "the bound splits a reading over many poses, which no plan can"
+    if s.all_effects_std_m is not None:
+        yield s.quantity, f"± {length(s.all_effects_std_m)}, predicted for the {s.position}"
+        yield "", _all_effects_note(s)
+    elif s.position_std_m is not None:
         yield s.quantity, f"± {length(s.position_std_m)}, predicted for the {s.position}"
         yield "", s.position_note
+
+
+def _all_effects_note(s: PlanSummary) -> str:
+    """Return a sentence on what `all_effects_std_m` includes, and on other plans."""
+    note = (
+        f"rms error of the fitted {s.quantity}, repeatability not included: every effect of the "
+        "catalogue is unknown, and as large as arms have it or as the readings so far tell it"
+    )
+    if s.random_std_m is not None:
+        note += f"; as many random poses: ± {length(s.random_std_m)}"
+    if s.position_std_m is not None:
+        note += f"; if the model were complete: ± {length(s.position_std_m)}"
+    return note
+
+
+def _std(point: CurvePoint) -> float:
+    """Return the uncertainty with all effects, where the plan is for them."""
+    std = point.all_effects_std_m
+    return point.position_std_m if std is None else std
 
 
 def order_remark(s: PlanSummary) -> str:
@@ -215,11 +244,11 @@ def _criteria_table(s: PlanSummary) -> Iterator[Block]:
 
 def _curve(s: PlanSummary) -> Table:
     out = table("poses", "predicted ±", "", left=(2,))
-    top = max(point.position_std_m for point in s.curve)
+    top = max(map(_std, s.curve))
     for point in s.curve:
-        size = max(1, round(BAR_WIDTH * point.position_std_m / top)) if top > 0 else 1
+        size = max(1, round(BAR_WIDTH * _std(point) / top)) if top > 0 else 1
         this = point.poses == s.poses
-        bar, std = "█" * size + "  this plan" * this, length(point.position_std_m)
+        bar, std = "█" * size + "  this plan" * this, length(_std(point))
         out.add(str(point.poses), std, bar, tone="strong" if this else "text")
     return out
 
@@ -227,10 +256,10 @@ def _curve(s: PlanSummary) -> Table:
 def enough_poses_sentence(curve: Sequence[CurvePoint]) -> str:
     """Return a sentence on the number of poses from which more of them change little."""
     last = curve[-1]
-    first = next(p for p in curve if p.position_std_m <= SIMILAR_RATIO * last.position_std_m)
+    first = next(p for p in curve if _std(p) <= SIMILAR_RATIO * _std(last))
     if first is last:
         return f"More than {last.poses} poses still improve the prediction."
-    gain = numbers.percent(1.0 - last.position_std_m / first.position_std_m)
+    gain = numbers.percent(1.0 - _std(last) / _std(first))
     what = "the prediction's uncertainty falls by"
     return f"From {first.poses} to {last.poses} poses {what} {gain} only."
 

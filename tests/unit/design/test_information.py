@@ -407,6 +407,11 @@ def test_named_work_and_a_box():
     assert prediction_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
     short = config_of("absolute", work_q_rad=((0.0, 1.0),))
     refusal("2 values; ur10e has 6 joints", prediction_poses, a, short, q)
+    degrees = config_of(
+        "absolute", work_q_rad=((0.0, 1.0, 1.0, 0.0, 1.0, 0.0), (0.0, -90.0, *q[0, 2:]))
+    )
+    message = "vector 2: joint 2 is at -90 rad; its range is -6.283 to 6.283 rad"
+    refusal(message, prediction_poses, a, degrees, q)
     low, high = (0.3, -0.6, 0.2), (1.0, 0.6, 0.9)
     box = config_of("absolute", work_min_m=low, work_max_m=high)
     work = prediction_poses(a, box, np.empty((0, 6)), lambda x: x[:, 0] > 0.1)

@@ -104,6 +104,23 @@ def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(mo
         assert of_few == pytest.approx(of_all[np.ix_(kept, kept)], rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
+def test_what_is_predicted_counts_the_directions_that_are_left_out(monkeypatch, mode):
+    """Before further readings all of it is known; later nothing is learnt of these directions."""
+    of, work = scene(mode, fitted=True)
+    monkeypatch.setattr(condensing, "DIRECTIONS", 12)
+    few = mixed_design(of, config(mode), work)
+    monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
+    monkeypatch.setattr(condensing, "LEAST", 0.0)
+    whole = mixed_design(of, config(mode), work)
+    assert few.criterion.rest > 0
+    for d in (few, balanced(few)):
+        assert d.criterion.std(d.prior) == pytest.approx(whole.criterion.std(whole.prior), rel=1e-6)
+    counts = np.ones(len(of.units))
+    stds = [d.criterion.std(d.prior + d.units.information(counts)) for d in (whole, few)]
+    assert stds[0] <= stds[1] < whole.criterion.std(whole.prior)
+
+
 def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     """After many readings: the same mean variance in balanced coordinates, and a plan is found."""
     of, work = scene("absolute", fitted=True)

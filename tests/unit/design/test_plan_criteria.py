@@ -330,7 +330,7 @@ def test_many_units(most):
 
 
 def test_budget_too_small_for_the_parameters():
-    units, message = random_units(9, 50, 6), "budget of 2 takes 2 units, too few.*raise the budget"
+    units, message = random_units(9, 50, 6), "2 readings or poses are too few.*ask for more"
     for criterion in (D(), MeanVariance(np.eye(6) / 6), E(), K()):
         refusal_of(CannotAnswerError, message, best_design, asked(units, criterion), 2.0, effort=50)
 

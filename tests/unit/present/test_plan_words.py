@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.design.choice import not_ruled_out
 from hilcal.design.next import PairPower
-from hilcal.design.summary import PredictedParameter
+from hilcal.design.summary import CurvePoint, PredictedParameter
 from hilcal.present.plan import (
     efficiency_sentence,
     enough_poses_sentence,
@@ -65,13 +65,28 @@ def test_what_is_absent_is_not_told(shown):
 
 def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown):
     words = " ".join(shown(replace(SUMMARY, asked_poses=24)).split())
-    fewer = "3 and the reference: the cell leaves no more of 24; some are read again"
+    fewer = "3 and the reference: the candidates leave no more of 24; some are read again"
     assert fewer in words
-    assert "the cell leaves" not in shown(replace(SUMMARY, asked_poses=3))
+    assert "candidates leave" not in shown(replace(SUMMARY, asked_poses=3))
     lost = PredictedParameter("joint_compliance.j1", np.inf, 4.2e-6, "rad/(N·m)")
     summary = replace(SUMMARY, parameters=(lost,))
     assert "joint_compliance.j1 not determined 4.20 µrad" in " ".join(shown(summary).split())
     assert "accuracy of the robot" in str(summary.to_dict()["position_note"])
+
+
+def test_a_plan_for_predictions_says_what_a_real_arm_is_mispredicted_by(shown):
+    curve = (CurvePoint(3, 12e-6, None, 2.5e-4), CurvePoint(6, 11.5e-6, None, 1e-4))
+    of_all = {"all_effects_std_m": 2.5e-4, "random_std_m": 3.2e-4, "efficiency": 0.16}
+    summary = replace(SUMMARY, criterion="I", curve=curve, **of_all)
+    words = " ".join(shown(summary).split())
+    for told in (
+        "deflection ± 250 µm, predicted for",
+        "as many random poses: ± 320 µm; if the model were complete: ± 12.0 µm",
+        "splits a reading over many poses, which no plan can",
+        "More than 6 poses still improve the prediction.",
+    ):
+        assert told in words
+    assert summary.to_dict()["all_effects_std_m"] == 2.5e-4
 
 
 @pytest.mark.parametrize(
