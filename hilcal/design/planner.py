@@ -27,7 +27,7 @@ from hilcal.design.run_order import Ordered, Ordering, PoseReadings, order_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried.carried_prior import CarriedPrior
+from hilcal.identification.carried.carried_prior import CarriedPrior, check_same_links
 from hilcal.identification.fit import Fit
 from hilcal.identification.registration.placement import MIN_POSES
 from hilcal.measuring.route import seconds_at_rest
@@ -192,6 +192,9 @@ def plan_readings(
 ) -> Planned:
     """Return a plan of a cell."""
     config = cell.configured()
+    if fit is not None:
+        fitted = fit.model.cell.arm
+        check_same_links("the fit to plan after", fitted.name, fitted.links, cell.arm)
     usual = "I" if config.planning.readings == "absolute" else "D"
     criterion = choice.criterion_name(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
@@ -211,7 +214,7 @@ def plan_readings(
     if not cell.registration_known and fit is None and count + 1 < MIN_POSES:
         raise _too_few_poses(count + 1, unit)
     budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
-    limits.check_planned(f"{count} {unit}", "readings", int(budget))
+    limits.check_planned(f"{count} poses" if by_poses else "the plan", "readings", int(budget))
     objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:

@@ -199,15 +199,20 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
 
 def check_arm(prior: CarriedPrior, arm: Arm) -> None:
     """Refuse a prior of an arm with other joints or other links."""
-    p, label = prior.posterior, _label(prior.posterior)
-    if p.links.shape != arm.links.shape:
+    p = prior.posterior
+    check_same_links(_label(p), p.arm, p.links, arm)
+
+
+def check_same_links(what: str, name: str, links: Floats, arm: Arm) -> None:
+    """Refuse `what` if its arm `name` has other joints or other links (n + 1, 4, 4) than an arm."""
+    if links.shape != arm.links.shape:
         raise InputError(
-            f"{label} is of the arm {p.arm} with {len(p.links) - 1} joints, this one, {arm.name}, "
+            f"{what} is of the arm {name} with {len(links) - 1} joints, this one, {arm.name}, "
             f"has {arm.n}; valid: a campaign of the same arm"
         )
-    if np.abs(p.links - arm.links).max() > SAME_M:
+    if np.abs(links - arm.links).max() > SAME_M:
         raise InputError(
-            f"{label} is of the arm {p.arm}, whose nominal links differ from those of {arm.name}; "
+            f"{what} is of the arm {name}, whose nominal links differ from those of {arm.name}; "
             "valid: a campaign of the same arm, described alike"
         )
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilcal.cell import cell_from_config
 from hilcal.design import choice as condensing
 from hilcal.design.approximate_design import relax
 from hilcal.design.choice import EFFORT, balanced, mixed_design, objective_of, other_effects
@@ -18,7 +19,9 @@ from hilcal.design.information import (
 )
 from hilcal.design.nominal_model import model_after, nominal_model
 from hilcal.design.optimum import best_design
+from hilcal.design.planner import PlanRequest, plan_readings
 from hilcal.design.predicted import position_derivative, prediction_poses
+from hilcal.errors import InputError
 from tests.support.campaigns import campaign, cell_of
 from tests.support.fit_cases import fitted_model
 from tests.support.plan_cases import changed, config_of, poses_of
@@ -119,6 +122,15 @@ def test_what_is_predicted_counts_the_directions_that_are_left_out(monkeypatch, 
     counts = np.ones(len(of.units))
     stds = [d.criterion.std(d.prior + d.units.information(counts)) for d in (whole, few)]
     assert stds[0] <= stds[1] < whole.criterion.std(whole.prior)
+
+
+@pytest.mark.long
+def test_a_plan_after_a_fit_of_another_arm_is_refused():
+    c = campaign(mode="absolute", poses=8, seed=3, registration_known=True)
+    found = fitted_model(c.cell, c.readings, "absolute")
+    other = changed(config("absolute"), robot={"model": "ur5e"})
+    with pytest.raises(InputError, match="of the arm ur10e, whose nominal links differ"):
+        plan_readings(cell_from_config(other), PlanRequest(4), np.random.default_rng(0), found)
 
 
 def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
