@@ -80,6 +80,7 @@ cells = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(cells, st.integers(0, 99))
 def test_no_candidate_ever_breaks_a_limit(sections, seed):

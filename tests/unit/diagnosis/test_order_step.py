@@ -60,7 +60,8 @@ def test_a_diagnosis_alone_names_the_step_where_a_drift_passes():
     assert d.step.previous < FIRST <= d.step.first
 
 
-@pytest.mark.parametrize("joint", first(1, [2, 3]))
+@pytest.mark.long
+@pytest.mark.parametrize("joint", [2, 3])
 def test_a_joint_that_slipped_is_named_with_its_row(joint):
     r, model = C.readings, baseline(C.cell, C.readings, "absolute")
     q = r.states.q.copy()

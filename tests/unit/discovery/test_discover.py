@@ -287,6 +287,7 @@ def test_a_law_is_searched_again_beside_what_was_added_after_it():
     assert replaced.fit.model.names[-2:] == (tilt, "shorter")
 
 
+@pytest.mark.long
 def test_a_number_that_the_model_absorbs_is_dropped():
     """The zero of a compliance that is no constant: the model has one already."""
     form = with_zero("τ_3")

@@ -77,6 +77,7 @@ def test_whitening_is_the_root_of_the_full_covariance(mode, m):
                 assert len(np.unique(key[row])) == 1
 
 
+@pytest.mark.long
 @BOTH
 def test_p_values_and_standard_errors(mode):
     """With the scatter in common χ² is χ² and errors are as stated; taken apart they are not."""

@@ -23,7 +23,6 @@ from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal, refusal_of
-from tests.support.rows import first
 
 
 def rms(x):
@@ -136,7 +135,8 @@ MISSING = [
 ]
 
 
-@pytest.mark.parametrize(("effect", "mode"), first(1, MISSING))
+@pytest.mark.long
+@pytest.mark.parametrize(("effect", "mode"), MISSING)
 def test_halves_agree_within_what_is_stated_where_a_large_effect_is_missing(effect, mode):
     stated, formal, inflated = halves(effect, mode, 6.0, range(3))
     assert inflated.all()

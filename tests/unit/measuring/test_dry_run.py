@@ -244,6 +244,7 @@ def test_duration_is_that_of_the_leading_joint(way, speed, acceleration, other):
     assert np.trapezoid(v, t) == pytest.approx(way, rel=1e-4)
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 6), min_size=2, max_size=4, unique=True))
 def test_whatever_passes_keeps_every_limit_on_its_whole_way(drawn):

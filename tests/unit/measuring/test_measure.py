@@ -135,6 +135,7 @@ def test_one_in_five_may_be_left_out_and_named_and_more_is_no_reading(count, bad
     assert result.covariance == pytest.approx(clean.covariance, rel=1e-12)
 
 
+@pytest.mark.long
 def test_good_samples_are_never_left_out():
     rng = np.random.default_rng(8)
     for count in (3, 5, 10, 50):

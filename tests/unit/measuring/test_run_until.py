@@ -109,6 +109,7 @@ def test_the_way_home_is_clear(b):
     assert [s.name for s in free] == ["reference"]
 
 
+@pytest.mark.long
 def test_resuming_towards_a_farther_goal():
     b, plan = Bench(), usual_plan()
     b.measure(plan, goal=Enough(7))

@@ -77,6 +77,7 @@ def test_without_noise_everything_is_recovered(seed, mass, com, poses):
     assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
 
 
+@pytest.mark.long
 def test_estimates_scatter_as_their_covariance_says(rng):
     K, N = 8, 1500
     R, cov = rotations(K, rng), covariances(K, rng)

@@ -10,7 +10,6 @@ from studies.benchmark.campaign import campaign
 from studies.benchmark.mujoco_tasks import SHOWN
 from studies.benchmark.world_elastic import bare
 from studies.benchmark.world_mujoco import Springs
-from tests.support.rows import first
 
 
 def drawn(softness, rng):
@@ -33,7 +32,8 @@ def drawn(softness, rng):
     }
 
 
-@pytest.mark.parametrize("robot", first(1, ["xarm6", "ur10e"]))
+@pytest.mark.long
+@pytest.mark.parametrize("robot", ["xarm6", "ur10e"])
 def test_two_mechanics_agree_to_a_micrometre(robot):
     """Those of `hilcal.drivers.simulated` and these share no code; parameters are the same."""
     rng = np.random.default_rng(6)
