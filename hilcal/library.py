@@ -60,6 +60,7 @@ from hilcal.types import Floats
 PATHS = (str, Path)
 A_CELL = "a Cell, as hc.Cell.load('CELL.toml')"
 A_FIT = "a Fit, as of hc.fit(model, readings)"
+A_SEED = "a whole number, 0 or more"
 A_PRIOR = "a Posterior, as of hc.load_posterior('run.hilcal')"
 A_MODEL = "a Model, as of hc.baseline(cell, readings)"
 READINGS = (
@@ -232,7 +233,7 @@ def bootstrap(
         scheduler: address of a Dask cluster to use instead.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
-        return bootstraps.bootstrap(fit, engine, draws, seed)
+        return bootstraps.bootstrap(fit, engine, draws, _checked_seed(seed))
 
 
 @with_one_blas_thread
@@ -487,7 +488,7 @@ def plan(
     expect(cell, Cell, "cell", A_CELL)
     expect(poses, (int, np.integer), "poses", "a whole number from 1")
     expect(given, (Fit, type(None)), "given", A_FIT)
-    config, rng = cell.configured(), np.random.default_rng(seed)
+    config, rng = cell.configured(), np.random.default_rng(_checked_seed(seed))
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
     request = PlanRequest(poses, criterion=criterion)
@@ -539,6 +540,7 @@ def simulate(
     expect(plan, (CheckedPlan, Plan), "plan", "a plan, as of hc.plan(cell), or its path")
     bare_plan = plan if isinstance(plan, Plan) else plan.plan
     expect(cell, (Cell, rehearsal.SimulationCase), "cell", f"{A_CELL}, or a previous result")
+    _checked_seed(seed)
     if not isinstance(cell, Cell):
         return rehearsal.simulate_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:
@@ -582,6 +584,13 @@ def view(run: Campaign | str | Path, port: int = 9877) -> Served:
         url = server.enter_context(serve(build_story(campaign.chapters()), port=port))
     atexit.register(server.close)
     return Served(url, server.close)
+
+
+def _checked_seed(seed: int) -> int:
+    expect(seed, (int, np.integer), "seed", A_SEED)
+    if seed < 0:
+        raise InputError(f"seed = {seed}; valid: {A_SEED}")
+    return seed
 
 
 def _either(readings: str | None, mode: str | None) -> str | None:

@@ -200,6 +200,8 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     (lambda s: hc.discover(str(s.run)), "fit is of class str; valid: a Fit"),
     (lambda s: hc.validate(s.model, s.run), "run is of class Model; valid: a Campaign"),
     (lambda s: hc.plan(str(s.cell)), "cell is of class str; valid: a Cell"),
+    (lambda s: hc.plan(hc.Cell.load(s.cell), seed=-1), "seed = -1; valid: a whole number"),
+    (lambda s: hc.plan(hc.Cell.load(s.cell), seed="a"), "seed is of class str; valid: a"),
     (lambda s: hc.plan(s.loaded, poses="ten"), "poses is of class str; valid: a whole number"),
     (lambda s: hc.simulate(s.loaded, None), "plan is None; valid: a plan"),
     (lambda s: hc.check_effect("creep"), "'creep' is no class of an effect"),
