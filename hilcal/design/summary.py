@@ -253,7 +253,9 @@ def remarks(planned: Planned) -> tuple[str, ...]:
     readings, efficiency = int(planned.design.cost), planned.design.efficiency
     suboptimal = planned.asked_poses is not None and efficiency < NOTABLE_EFFICIENCY
     if planned.criterion == "I":  # no plan comes near the bound, which splits single readings
-        if len(planned.problem.candidates.loads) > 1 and planned.asked_poses is not None:
+        positions = planned.problem.nominal.cell.configured().planning.readings == "absolute"
+        several = positions and len(planned.problem.candidates.loads) > 1
+        if several and planned.asked_poses is not None:
             omitted += (
                 "many poses without a load can tell more than few poses under every load: "
                 f"--readings {readings} chooses among both",
