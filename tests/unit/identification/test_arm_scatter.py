@@ -80,15 +80,15 @@ def test_whitening_is_the_root_of_the_full_covariance(mode, m):
 @pytest.mark.long
 @BOTH
 def test_p_values_and_standard_errors(mode):
-    """With the scatter in common χ² is χ² and errors are as stated; taken apart they are not."""
+    """They are right where an arrival's rows share its scatter; else the errors are understated."""
     p_values, z, apart = [], [], []
     for seed in range(12):
         c = reflectors(seed=seed, poses=8, joint_std=STD, known=(False, False, True))
         true = c.world.physics.joint_compliance
-        for readings, found in ((c.readings, z), (replace(c.readings, common=None), apart)):
+        for readings, errors in ((c.readings, z), (replace(c.readings, common=None), apart)):
             f = fitted_model(c.cell, readings, mode)
-            found.append((f.theta[-6:] - true) / f.uncertainty.formal[-6:])
-            if found is z:
+            errors.append((f.theta[-6:] - true) / f.uncertainty.formal[-6:])
+            if errors is z:
                 p_values.append(chi2.sf(f.chi2, f.dof))
     assert kstest(p_values, "uniform").pvalue > 0.01
     # 72 standardised errors: rms within 1 ± 0.25 (3 σ); about √3 where rows count as arrivals.
@@ -274,14 +274,16 @@ def refined(tmp_path_factory):
             file.append_readings(what)
     with hc.Campaign.open(path) as run:
         assert not run.readings.scatter_stated
-        found = hc.refine(hc.baseline(run.cell, run.readings, "absolute"), run.readings, "absolute")
-        first, last = found.steps[0], found.steps[-1]
+        refinement = hc.refine(
+            hc.baseline(run.cell, run.readings, "absolute"), run.readings, "absolute"
+        )
+        first, last = refinement.steps[0], refinement.steps[-1]
         assert (first.diagnosis.reason, last.diagnosis.verdict) == ("arm_scatter", "adequate")
         assert last.added is None
         assert last.fit.variance_factor == pytest.approx(1, abs=0.15)
         assert "Nothing recorded predicts it" in str(last.diagnosis.to_dict()["message"])
         assert content_hash(last.fit.readings) == content_hash(run.readings)
-        run.append(found)
+        run.append(refinement)
     return path, other, last
 
 
@@ -291,20 +293,22 @@ def test_fresh_readings_scatter_as_the_fit_with_a_background_estimated():
     (cell, readings), (_, anew) = scattering(6e-5), scattering(6e-5, draw=7)
     plain = fitted_model(cell, readings, "absolute")
     wide = with_background(plain, plain.model.named)
-    seen = validate(wide.model, wide.theta, wide.readings, anew, "absolute")
-    told = extrapolation(predictive_of(wide), wide.readings, seen)
-    assert np.sqrt(np.mean(told.z**2)) == pytest.approx(1, abs=0.2)
-    assert seen.noise_floor < 0.5 * seen.error.rms_m  # noise alone remains the instrument's
+    validation = validate(wide.model, wide.theta, wide.readings, anew, "absolute")
+    beyond = extrapolation(predictive_of(wide), wide.readings, validation)
+    assert np.sqrt(np.mean(beyond.z**2)) == pytest.approx(1, abs=0.2)
+    assert (
+        validation.noise_floor < 0.5 * validation.error.rms_m
+    )  # noise alone remains the instrument's
 
 
 @pytest.mark.long
 def test_fresh_readings_scatter_as_the_fit_estimated(refined):
     path, other, last = refined
-    found = hc.validate(path, other)
-    assert np.sqrt(np.mean(found.beyond.z**2)) == pytest.approx(1, abs=0.15)
-    assert found.shares.everything.within > 0.9
-    alone = found.prediction.noise_floor  # of the instrument
-    assert np.sqrt(np.mean(found.beyond.stated_m**2)) > np.hypot(alone, 20e-6)
+    validation = hc.validate(path, other)
+    assert np.sqrt(np.mean(validation.beyond.z**2)) == pytest.approx(1, abs=0.15)
+    assert validation.shares.everything.within > 0.9
+    alone = validation.prediction.noise_floor  # of the instrument
+    assert np.sqrt(np.mean(validation.beyond.stated_m**2)) > np.hypot(alone, 20e-6)
     with hc.Campaign.open(path) as run:
         stored = run.predictive(run.latest(), *run.restore_model(run.latest()))
     fitted = predictive_of(last.fit)
@@ -348,9 +352,9 @@ def test_p_values_stay_uniform_with_an_estimated_covariance(seeds):
         cell, readings = scattering(seed=seed)
         plain = fitted_model(cell, readings, "absolute")
         with_it = with_arm_scatter(plain.model.cell, readings, estimate_arm_scatter(plain))
-        found = fit(plain.model, with_it, "absolute", start=plain.theta)
-        absent = next(e for e in candidates(found) if e.name == "joint_tilt_compliance")
-        p_values.append(linearise(found).score(effect_columns(found, absent).white).p_value)
+        fitted = fit(plain.model, with_it, "absolute", start=plain.theta)
+        absent = next(e for e in candidates(fitted) if e.name == "joint_tilt_compliance")
+        p_values.append(linearise(fitted).score(effect_columns(fitted, absent).white).p_value)
     assert kstest(p_values, "uniform").pvalue > 1e-3
 
 
@@ -367,10 +371,10 @@ def test_targets_of_one_arrival_have_it_in_common(mode):
     assert abs(s.std[0] - 3e-5) < 4 * s.std_error[0]
     with_it = with_arm_scatter(plain.model.cell, readings, s)
     assert with_it.common is not None
-    found = fit(plain.model, with_it, mode, start=plain.theta)
+    fitted = fit(plain.model, with_it, mode, start=plain.theta)
     assert plain.variance_factor > 3
     # Taken for independent, the scatter would leave about a third of the degrees of freedom.
-    assert found.variance_factor == pytest.approx(1, abs=0.25)
+    assert fitted.variance_factor == pytest.approx(1, abs=0.25)
 
 
 @pytest.mark.long
@@ -381,8 +385,8 @@ def test_an_orientation_stated_too_noisy_does_not_hide_the_arm():
     stated = replace(readings, covariance=covariance)
     plain = fitted_model(cell, stated, "absolute")
     with_it = with_arm_scatter(plain.model.cell, stated, estimate_arm_scatter(plain))
-    found = fit(plain.model, with_it, "absolute")
-    assert found.variance_factor < 0.8
-    d = diagnose(found)
+    fitted = fit(plain.model, with_it, "absolute")
+    assert fitted.variance_factor < 0.8
+    d = diagnose(fitted)
     assert d.verdict == "adequate"
     assert "stated too large in some of its elements" in str(d.to_dict()["message"])

@@ -68,7 +68,7 @@ def series(ipa_ur10):
 
 
 @pytest.fixture(scope="module")
-def found(series):
+def refinement(series):
     some = series[:30]
     return refine(baseline(UR10, some, "absolute"), some, "absolute", background=True)
 
@@ -79,17 +79,17 @@ def error(fit, of):
 
 
 @pytest.mark.long
-def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
-    added = [step.added for step in found.steps]
-    before = found.steps[added.index(BACKGROUND) - 1].fit
-    assert error(found.fit, series[500:]) < 0.7 * error(before, series[500:])
-    assert error(found.fit, series[500:]) < 0.32e-3  # the same geometry with a ridge: 0.44 mm
+def test_it_predicts_other_poses_far_better_than_what_is_named(refinement, series):
+    added = [step.added for step in refinement.steps]
+    before = refinement.steps[added.index(BACKGROUND) - 1].fit
+    assert error(refinement.fit, series[500:]) < 0.7 * error(before, series[500:])
+    assert error(refinement.fit, series[500:]) < 0.32e-3  # the same geometry with a ridge: 0.44 mm
     named = {"base_frame", "target_offset", "link_geometry", "transmission_error"}
-    assert set(found.fit.model.named) <= named  # what all 1490 poses prove
-    assert found.verdict == "ambiguous"
+    assert set(refinement.fit.model.named) <= named  # what all 1490 poses prove
+    assert refinement.verdict == "ambiguous"
     assert {"link_geometry", "transmission_error"} <= {
-        *found.fit.model.named,
-        *(s.effect for s in found.diagnosis.suspects if s.score.p_value < 0.1),
+        *refinement.fit.model.named,
+        *(s.effect for s in refinement.diagnosis.suspects if s.score.p_value < 0.1),
     }
 
 
@@ -129,34 +129,34 @@ def test_the_band_of_one_orientation_is_narrow_in_it_and_wide_in_others(one_orie
     assert np.any([o.points for o in other.outside], axis=0).all()
 
 
-def test_of_effects_only_that_of_implausible_size_is_left_out(found, series):
-    some, (name, *_) = series[:30], background_of(found.fit).effects
+def test_of_effects_only_that_of_implausible_size_is_left_out(refinement, series):
+    some, (name, *_) = series[:30], background_of(refinement.fit).effects
     plausible = UR10.configured().model_copy(update={"plausible": {name: 1e-3}})
     first = fit(baseline(UR10.with_config(plausible), some, "absolute"), some, "absolute")
     together = with_background(first, first.model.names)
     assert together is not None
-    assert {*found.fit.model.names} - {*together.model.names} == {name}
+    assert {*refinement.fit.model.names} - {*together.model.names} == {name}
     assert error(together, series[500:]) < 0.5 * error(first, series[500:])
 
 
 @pytest.mark.long
-def test_it_is_stored_and_found_again(found, series):
-    fit, some = found.fit, series[:30]
-    record = to_record(fit, found.diagnosis.to_dict(), BACKGROUND, content_hash(fit.readings))
+def test_it_is_stored_and_found_again(refinement, series):
+    fit, some = refinement.fit, series[:30]
+    record = to_record(fit, refinement.diagnosis.to_dict(), BACKGROUND, content_hash(fit.readings))
     again = restore(from_text(to_text(record), 2), UR10, some)
     assert again.model.named == fit.model.named == record.effects
     assert again.model.background == fit.model.background
     moved = again.predict(series[:50].states).position - fit.predict(series[:50].states).position
     assert np.abs(moved).max() < 1e-7
     assert again.holdout.rms_m == pytest.approx(fit.holdout.rms_m, rel=1e-3)
-    assert diagnose(again).verdict == found.verdict
+    assert diagnose(again).verdict == refinement.verdict
     stored = dict(record.parameters_json)
     stored["random"] = {**stored["random"], "std": {"joint_compliance": [1.0]}}
     refusal("is damaged", restore, replace(record, parameters_json=stored), UR10, some)
 
 
-def test_naming_keeps_the_prediction_and_removing_does_not(found, series):
-    fit = found.fit
+def test_naming_keeps_the_prediction_and_removing_does_not(refinement, series):
+    fit = refinement.fit
     name = background_of(fit).effects[0]
     named = add(fit, name)
     assert name in named.model.named
@@ -170,21 +170,21 @@ def test_naming_keeps_the_prediction_and_removing_does_not(found, series):
     assert np.abs(without.theta).max() > 0
 
 
-def test_what_it_moves_is_told_by_effect(found):
-    of = background_of(found.fit)
+def test_what_it_moves_is_told_by_effect(refinement):
+    of = background_of(refinement.fit)
     assert of.rms_m > 0
-    assert set(of.effects) == set(found.fit.model.background)
-    listed = {p.name for p in found.fit.parameters}
-    assert not any(name.split(".")[0] in found.fit.model.background for name in listed)
-    shown = f"{' + '.join(found.fit.model.named)} + background of {len(of.effects)}"
-    for result in (found.fit, found, found.diagnosis):
+    assert set(of.effects) == set(refinement.fit.model.background)
+    listed = {p.name for p in refinement.fit.parameters}
+    assert not any(name.split(".")[0] in refinement.fit.model.background for name in listed)
+    shown = f"{' + '.join(refinement.fit.model.named)} + background of {len(of.effects)}"
+    for result in (refinement.fit, refinement, refinement.diagnosis):
         assert f"model: {shown}\n" in repr(result)
 
 
-def test_the_sizes_of_its_families_are_told_with_intervals(found):
-    sizes = family_sizes(found.fit)
+def test_the_sizes_of_its_families_are_told_with_intervals(refinement):
+    sizes = family_sizes(refinement.fit)
     effects = {s.effect for s in sizes}
-    model = found.fit.model
+    model = refinement.fit.model
     assert effects == set(model.names) - {"base_frame", "target_offset"}
     assert {s.effect for s in sizes if s.named} == effects & set(model.named)
     assert all(0.0 < s.low < s.std < s.high for s in sizes)
@@ -195,16 +195,16 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found):
     # what moves nothing is known by its prior alone
     widths = [s.high / s.low for s in sizes]
     assert widths[0] < 0.2 * max(widths)
-    assert family_sizes(found.steps[0].fit) == ()
+    assert family_sizes(refinement.steps[0].fit) == ()
 
 
 @pytest.mark.long
-def test_a_scatter_larger_than_an_arms_is_noise_only_where_repeats_show_it(found):
+def test_a_scatter_larger_than_an_arms_is_noise_only_where_repeats_show_it(refinement):
     """What few poses do not resolve scatters alike; the effects of a background are in doubt."""
-    model = replace(found.fit.model, background=frozenset({"joint_stiffening"}))  # not there
-    scatter = replace(found.fit.readings.arm_scatter, size_m=1e-3)
+    model = replace(refinement.fit.model, background=frozenset({"joint_stiffening"}))  # not there
+    scatter = replace(refinement.fit.readings.arm_scatter, size_m=1e-3)
     large = replace(
-        found.fit, model=model, readings=replace(found.fit.readings, arm_scatter=scatter)
+        refinement.fit, model=model, readings=replace(refinement.fit.readings, arm_scatter=scatter)
     )
     d = diagnose(large)
     assert (d.verdict, d.reason) == ("ambiguous", "background")
@@ -233,14 +233,14 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
 
 @pytest.mark.long
 def test_the_scatter_does_not_depend_on_how_large_the_noise_is_stated(series):
-    found, alone = [], []
+    scatters, alone = [], []
     for by in (1.0, 25.0):
         some = replace(series[:40], covariance=by * series[:40].covariance)
         first = fit(baseline(UR10, some, "absolute"), some, "absolute")
         fitted = with_background(first, first.model.names)
-        found.append(fitted.readings.arm_scatter)
+        scatters.append(fitted.readings.arm_scatter)
         alone.append(full_prediction(fitted).noise_floor)
-    usual, larger = found
+    usual, larger = scatters
     assert alone[1] == pytest.approx(alone[0], rel=0.2)
     assert larger.unit < 0.5 * usual.unit
     assert larger.size_m == pytest.approx(usual.size_m, rel=0.2)
@@ -259,22 +259,22 @@ def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses():
     case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)
     some = case.readings[case.readings.load == 0]
     assert len(some) == 25
-    found = refined(case.cell, some, "absolute")
-    added = [step.added for step in found.steps]
-    alone = found.steps[added.index(BACKGROUND) - 1]
+    refinement = refined(case.cell, some, "absolute")
+    added = [step.added for step in refinement.steps]
+    alone = refinement.steps[added.index(BACKGROUND) - 1]
     _, loads = with_study_loads(config, "ur10e")
     fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
     true = case.world.ideal_readings(fresh).position
-    error = np.linalg.norm(found.fit.predict(fresh).position - true, axis=1).mean()
+    error = np.linalg.norm(refinement.fit.predict(fresh).position - true, axis=1).mean()
     before = np.linalg.norm(alone.fit.predict(fresh).position - true, axis=1).mean()
     assert error < 0.6 * before
-    stated = budget(found.fit)  # fitted poses are far nearer than any other is
-    assert stated.combined >= found.fit.holdout.rms_m > 3 * found.fit.error.rms_m
+    stated = budget(refinement.fit)  # fitted poses are far nearer than any other is
+    assert stated.combined >= refinement.fit.holdout.rms_m > 3 * refinement.fit.error.rms_m
     unloaded = replace(fresh, wrench=np.zeros_like(fresh.wrench))  # as what was fitted
-    off = found.fit.predict(unloaded).position - case.world.ideal_readings(unloaded).position
+    off = refinement.fit.predict(unloaded).position - case.world.ideal_readings(unloaded).position
     assert np.mean(np.linalg.norm(off, axis=1) <= stated.expanded) >= 0.9
-    assert found.verdict in ("missing_effect", "ambiguous")
-    assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
+    assert refinement.verdict in ("missing_effect", "ambiguous")
+    assert set(refinement.fit.model.named) - {"base_frame"} <= set(HIDDEN)
 
 
 @pytest.mark.long
@@ -282,18 +282,18 @@ def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
     law = "compliance by another joint"  # link lengths of 14 mm would predict it
     asked = DiagnosisCase("outside", "ur3e", "deflection", (law,), 3.0, 0)
     case = simulate(asked)
-    found = refined(case.cell, case.readings, asked.mode)
-    assert found.verdict == "unknown_effect"
-    assert not found.fit.model.background
+    refinement = refined(case.cell, case.readings, asked.mode)
+    assert refinement.verdict == "unknown_effect"
+    assert not refinement.fit.model.background
 
 
 @pytest.mark.long
 def test_noise_that_is_stated_too_small_is_no_background():
     asked = DiagnosisCase("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
     case = simulate(asked)
-    found = refined(case.cell, case.readings, asked.mode)
-    assert found.verdict == "noise_misjudged"
-    assert not found.fit.model.background
+    refinement = refined(case.cell, case.readings, asked.mode)
+    assert refinement.verdict == "noise_misjudged"
+    assert not refinement.fit.model.background
 
 
 @pytest.mark.long
@@ -305,21 +305,21 @@ def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
         )
         some = case.readings
         start = baseline(case.cell, some, "absolute")
-        found = refine(start, some, "absolute")
-        by_lines = replace(found.fit.model, random={})
-        lines = fit(by_lines, some, "absolute", start=found.fit.theta)
-        assert "transmission_error" in found.fit.model.random
-        assert not found.fit.model.background
+        refinement = refine(start, some, "absolute")
+        by_lines = replace(refinement.fit.model, random={})
+        lines = fit(by_lines, some, "absolute", start=refinement.fit.theta)
+        assert "transmission_error" in refinement.fit.model.random
+        assert not refinement.fit.model.background
         fresh, *_ = rehearsal_states(case.cell, 40, [], np.random.default_rng(seed))
         true = case.world.ideal_readings(fresh).position
         errors = [
             np.linalg.norm(x.predict(fresh).position - true, axis=1).mean()
-            for x in (found.fit, lines)
+            for x in (refinement.fit, lines)
         ]
         ratios.append(errors[0] / errors[1])
-        assert found.verdict == "adequate"
+        assert refinement.verdict == "adequate"
         # what a diagnosis of the stored revision would say
-        assert diagnose(found.fit, found.diagnosis.history).verdict == found.verdict
+        assert diagnose(refinement.fit, refinement.diagnosis.history).verdict == refinement.verdict
     assert np.exp(np.mean(np.log(ratios))) < 0.9
 
 
@@ -383,10 +383,10 @@ def test_without_added_effects_nothing_is_shrunk():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_law_that_the_catalogue_lacks_is_seen_beside_all_its_effects(seed):
     """All effects together hide a crossed gear of half a milliradian on the fitted poses."""
-    found = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False, law_rad=5e-4))
-    assert found.verdict == "unknown_effect"
+    outcome = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False, law_rad=5e-4))
+    assert outcome.verdict == "unknown_effect"
     # A remainder predicts the law; the best predictor knows it. Without one the ratio is 2 to 4.
-    assert found.rms_m < 1.5 * found.best_m
+    assert outcome.rms_m < 1.5 * outcome.best_m
     without = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False))
     assert without.verdict in ("ambiguous", "adequate")
 
@@ -428,10 +428,10 @@ def test_a_slip_in_time_that_all_effects_could_fit_is_unknown_and_they_are_left_
 @pytest.mark.slow
 @pytest.mark.parametrize(("poses", "seed"), [(600, 0), (600, 1), (1000, 2)])
 def test_many_poses_of_an_arm_with_every_effect_blame_no_noise_and_no_unknown_law(poses, seed):
-    found = all_effects(AllEffectsCase(poses, seed, factor=1.0, without=False))
-    assert found.verdict in ("ambiguous", "adequate")
-    assert found.rms_m < 1.03 * found.best_m
-    assert found.inside > 0.92
+    outcome = all_effects(AllEffectsCase(poses, seed, factor=1.0, without=False))
+    assert outcome.verdict in ("ambiguous", "adequate")
+    assert outcome.rms_m < 1.03 * outcome.best_m
+    assert outcome.inside > 0.92
 
 
 CONFIG = configuration()
@@ -441,21 +441,21 @@ TILT = "joint_tilt_compliance"
 def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence():
     case = study_case(CONFIG, "ur10e", "absolute", (TILT,), 3.0, 1, n_poses=10)
     start = baseline(case.cell, case.readings, "absolute")
-    found = mixed_fit(start, case.readings, "absolute")
+    mixed = mixed_fit(start, case.readings, "absolute")
     without = fit(start, case.readings, "absolute")
     _, loads = with_study_loads(CONFIG, "ur10e")
     fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
     true = case.world.ideal_readings(fresh).position
-    prediction = found.model.predict(fresh, found.theta)
-    x = found.problem.coordinates(found.model.jacobian(prediction, found.theta, 3))
-    position, spread = prediction.observation.position, x @ found.covariance @ np.swapaxes(x, 1, 2)
+    prediction = mixed.model.predict(fresh, mixed.theta)
+    x = mixed.problem.coordinates(mixed.model.jacobian(prediction, mixed.theta, 3))
+    position, spread = prediction.observation.position, x @ mixed.covariance @ np.swapaxes(x, 1, 2)
     error = np.linalg.norm(true - position, axis=1).mean()
     assert error < 0.5 * np.linalg.norm(true - without.predict(fresh).position, axis=1).mean()
     std = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     assert 0.85 < np.mean(np.abs(true - position) < 1.96 * std) <= 1.0
-    k = found.problem.families.names.index(TILT)
-    rng, log_std = np.random.default_rng(0), found.variances.log_std
-    assert evidence(found.problem, k, rng, log_std).p_value < 0.01
+    k = mixed.problem.families.names.index(TILT)
+    rng, log_std = np.random.default_rng(0), mixed.variances.log_std
+    assert evidence(mixed.problem, k, rng, log_std).p_value < 0.01
 
 
 def test_a_cell_says_how_large_an_effect_is_expected_to_be():
@@ -465,32 +465,32 @@ def test_a_cell_says_how_large_an_effect_is_expected_to_be():
         config = CONFIG.model_copy(update={"ordinary": {"tracker_scale": factor}})
         case = study_case(config, "ur10e", "absolute", (TILT,), 3.0, 1, n_poses=8)
         cell = replace(case.cell, config=config)
-        found = mixed_fit(baseline(cell, case.readings, "absolute"), case.readings, "absolute")
-        (f,) = (f for f in found.problem.families.random if f.effect == "tracker_scale")
+        mixed = mixed_fit(baseline(cell, case.readings, "absolute"), case.readings, "absolute")
+        (f,) = (f for f in mixed.problem.families.random if f.effect == "tracker_scale")
         assert f.prior.mean == pytest.approx(np.log(0.5 * factor), abs=0.01)
-        sizes[factor] = found.std("tracker_scale")
+        sizes[factor] = mixed.std("tracker_scale")
     assert sizes[0.1] < 0.3 * sizes[1.0]
 
 
 def test_a_hidden_effect_of_deflections_has_the_evidence():
     case = study_case(CONFIG, "ur10e", "deflection", (TILT,), 3.0, 1, n_poses=10)
     start = baseline(case.cell, case.readings, "deflection")
-    found = mixed_fit(start, case.readings, "deflection")
-    names, log_std = found.problem.families.names, found.variances.log_std
+    mixed = mixed_fit(start, case.readings, "deflection")
+    names, log_std = mixed.problem.families.names, mixed.variances.log_std
     p = {
-        name: evidence(found.problem, k, np.random.default_rng(0), log_std).p_value
+        name: evidence(mixed.problem, k, np.random.default_rng(0), log_std).p_value
         for k, name in enumerate(names)
         if name in (TILT, "base_compliance", "link_compliance", "backlash", "creep")
     }
     assert p.pop(TILT) < 0.001
     assert min(p.values()) > 0.01
     # the registration is known by its prior, and nothing else is of its size
-    assert found.std("base_frame") == pytest.approx(1.0, abs=0.01)
+    assert mixed.std("base_frame") == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("gross", [[2, 9, 21], [4, 17]])
-def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, found, series):
+def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, refinement, series):
     """3 mm, where the named effects alone leave 0.5 mm."""
     some, rng = series[:30], np.random.default_rng(8)
     value, off = some.value.copy(), rng.standard_normal((len(gross), 3))
@@ -498,9 +498,9 @@ def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, found,
     off = replace(some, value=value)
     again = refine(baseline(UR10, off, "absolute"), off, "absolute")
     assert np.flatnonzero(again.fit.outlier).tolist() == gross
-    assert not found.fit.outlier.any()
-    assert error(again.fit, series[500:]) < 1.15 * error(found.fit, series[500:])
-    assert again.verdict == found.verdict
+    assert not refinement.fit.outlier.any()
+    assert error(again.fit, series[500:]) < 1.15 * error(refinement.fit, series[500:])
+    assert again.verdict == refinement.verdict
     record = to_record(again.fit, again.diagnosis.to_dict(), BACKGROUND, content_hash(off))
     stored = restore(from_text(to_text(record), 2), UR10, off)
     assert stored.outlier.tolist() == again.fit.outlier.tolist()
@@ -535,9 +535,9 @@ def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
 
 
 @pytest.mark.long
-def test_beside_a_background_chance_explains_nothing(found):
+def test_beside_a_background_chance_explains_nothing(refinement):
     """Of an arm with the sizes of the background no variable explains the residual."""
-    f = found.fit
+    f = refinement.fit
     root, p_values = np.linalg.cholesky(f.readings.covariance), []
     std = np.concatenate(
         [f.model.random.get(e.name, np.zeros(len(e.parameters))) for e in f.model.effects]

@@ -40,15 +40,15 @@ def test_parameters_are_recovered_exactly_without_noise(mode, m):
     c = campaign(plan_seed=0, registration_known=True, m=m)
     model = baseline(c.cell, c.readings, mode)
     truth = c.world.physics.joint_compliance
-    found = fit(model, predicted(model, c.readings, truth), mode)
-    assert found.solution.converged
+    fitted = fit(model, predicted(model, c.readings, truth), mode)
+    assert fitted.solution.converged
     # Steps end below 1e-5 σ and shrink at least tenfold each.
-    np.testing.assert_array_less(np.abs(found.theta - truth), 1e-6 * found.uncertainty.formal)
-    np.testing.assert_allclose(found.theta, truth, rtol=1e-8)
-    assert found.chi2 < 1e-8
+    np.testing.assert_array_less(np.abs(fitted.theta - truth), 1e-6 * fitted.uncertainty.formal)
+    np.testing.assert_allclose(fitted.theta, truth, rtol=1e-8)
+    assert fitted.chi2 < 1e-8
     if m == 3:  # and by mechanics of its own: equilibria there hold to 1e-12 rad of 1e-3
-        found = fit(model, noiseless(c.world, plan()), mode)
-        np.testing.assert_allclose(found.theta, truth, rtol=1e-8)
+        fitted = fit(model, noiseless(c.world, plan()), mode)
+        np.testing.assert_allclose(fitted.theta, truth, rtol=1e-8)
 
 
 def far_off(rng):
@@ -72,10 +72,10 @@ def test_geometry_converges_from_large_errors(m, seed):
     model = of_names(FRAMES, replace(c.cell, gravity=np.zeros(3)), bare.states, m)
     truth = far_off(np.random.default_rng(seed))
     truth = truth if m == 6 else np.delete(truth, [9, 10, 11])
-    found = fit(model, predicted(model, bare, truth), "absolute")
-    assert found.solution.converged
-    assert found.solution.iterations <= 8
-    assert found.error.max_m < 1e-10
+    fitted = fit(model, predicted(model, bare, truth), "absolute")
+    assert fitted.solution.converged
+    assert fitted.solution.iterations <= 8
+    assert fitted.error.max_m < 1e-10
 
 
 def test_the_same_data_give_the_same_numbers_and_a_fit_is_found_again_from_its_own():
@@ -102,11 +102,11 @@ def test_which_families_stay_does_not_depend_on_where_a_fit_starts():
 
 def test_the_order_of_readings_and_of_effects_does_not_matter():
     c = campaign(plan_seed=0, target_known=False)
-    found = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
+    fitted = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
     shuffled = c.readings[np.random.default_rng(1).permutation(len(c.readings))]
-    turned = replace(found.model, effects=found.model.effects[::-1])
+    turned = replace(fitted.model, effects=fitted.model.effects[::-1])
     other = parameters_by_effect(fit(turned, shuffled, "absolute"))
-    for name, (value, std) in parameters_by_effect(found).items():
+    for name, (value, std) in parameters_by_effect(fitted).items():
         assert other[name][0] == pytest.approx(value, abs=1e-4 * std), name
         assert other[name][1] == pytest.approx(std, rel=1e-6), name
 
@@ -128,9 +128,9 @@ def seen_directions(model, readings, m):
         columns.append(both[0] - both[1])
     values = np.linalg.svd(np.array(columns).T, compute_uv=False)
     # Differences over a milliradian are right to 1e-6; nothing lies between that and what is seen.
-    seen = values > 1e-5 * values[0]
-    assert not np.any((values > 1e-6 * values[0]) & ~seen)
-    return int(seen.sum())
+    visible = values > 1e-5 * values[0]
+    assert not np.any((values > 1e-6 * values[0]) & ~visible)
+    return int(visible.sum())
 
 
 @pytest.mark.parametrize(("m", "expected"), [(3, 27), (6, 30)])
@@ -139,25 +139,25 @@ def test_an_over_complete_model_has_the_rank_that_the_arm_has(m, expected):
     c = campaign("link_geometry", plan_seed=0, poses=30, target_known=False, m=m)
     r = c.readings[c.readings.unloaded]
     r = replace(r, states=replace(r.states, wrench=0 * r.states.wrench))
-    found = fitted_model(replace(c.cell, gravity=np.zeros(3)), r, "absolute", ("link_geometry",))
-    assert seen_directions(found.model, r, m) == found.rank == expected
-    assert len(found.uncertainty.null) == found.model.size - expected
+    fitted = fitted_model(replace(c.cell, gravity=np.zeros(3)), r, "absolute", ("link_geometry",))
+    assert seen_directions(fitted.model, r, m) == fitted.rank == expected
+    assert len(fitted.uncertainty.null) == fitted.model.size - expected
 
 
 def test_what_cannot_be_seen_is_named_and_has_no_number():
     c = campaign("link_geometry", plan_seed=0, poses=30)
-    found = fitted_model(c.cell, c.readings, "absolute", GEOMETRY)
-    u, model, document = found.uncertainty, found.model, to_json(found)
+    fitted = fitted_model(c.cell, c.readings, "absolute", GEOMETRY)
+    u, model, document = fitted.uncertainty, fitted.model, to_json(fitted)
     compliance, links = (model.slices()[model.names.index(name)] for name in GEOMETRY)
-    assert found.rank < model.size
+    assert fitted.rank < model.size
     np.testing.assert_array_equal(np.isinf(u.std), ~u.identifiable)
     # A shift along a joint's axis can be made before or after the joint.
     assert not u.identifiable[links][2:38:6].any()
     assert u.identifiable[compliance].all()
-    for p, seen in zip(document["parameters"], u.identifiable, strict=True):
-        assert (p["value"] is None) == (p["std"] is None) == (not seen)
-        assert p["identifiable"] == bool(seen)
-    assert len(document["unidentifiable"]) == model.size - found.rank
+    for p, identifiable in zip(document["parameters"], u.identifiable, strict=True):
+        assert (p["value"] is None) == (p["std"] is None) == (not identifiable)
+        assert p["identifiable"] == bool(identifiable)
+    assert len(document["unidentifiable"]) == model.size - fitted.rank
     assert all("link_geometry" in name for name in document["unidentifiable"])
 
 
@@ -169,41 +169,43 @@ def test_no_more_elements_than_parameters_cannot_answer(mode, count):
         few = c.readings[(c.readings.pose < count) & np.isin(c.readings.load, [0, 3])]
     else:
         few = c.readings[np.flatnonzero(c.readings.load == 3)[:count]]
-    told = rf"{3 * count} measured elements for \d parameters.*measure at least (\d+)"
-    line = refusal_of(CannotAnswerError, told, fitted_model, c.cell, few, mode)
-    assert 3 * int(re.search(told, line)[1]) > 6
+    pattern = rf"{3 * count} measured elements for \d parameters.*measure at least (\d+)"
+    line = refusal_of(CannotAnswerError, pattern, fitted_model, c.cell, few, mode)
+    assert 3 * int(re.search(pattern, line)[1]) > 6
 
 
 @pytest.fixture(scope="module")
-def found():
+def absolute_fit():
     c = campaign(poses=8, mode="absolute")
     return fitted_model(c.cell, c.readings, "absolute")
 
 
-def test_parameters_are_those_of_the_document_and_of_the_data_frame(found):
-    assert found.parameters.to_dicts() == to_json(found)["parameters"]
-    second = found.parameters["joint_compliance.j2"]
-    k = [row.name for row in found.parameters].index("joint_compliance.j2")
-    assert second == found.parameters[k]
-    assert second.value == pytest.approx(found.theta[k])
+def test_parameters_are_those_of_the_document_and_of_the_data_frame(absolute_fit):
+    assert absolute_fit.parameters.to_dicts() == to_json(absolute_fit)["parameters"]
+    second = absolute_fit.parameters["joint_compliance.j2"]
+    k = [row.name for row in absolute_fit.parameters].index("joint_compliance.j2")
+    assert second == absolute_fit.parameters[k]
+    assert second.value == pytest.approx(absolute_fit.theta[k])
     assert second.unit == "rad/(N·m)"
-    frame = found.parameters.to_frame()
-    assert frame.index[0] == found.parameters[0].name
+    frame = absolute_fit.parameters.to_frame()
+    assert frame.index[0] == absolute_fit.parameters[0].name
     assert frame.loc["joint_compliance.j2", "std"] == second.std
     known = frame["identifiable"].to_numpy()
-    np.testing.assert_allclose(np.diag(found.covariance)[known] ** 0.5, frame["std"][known])
+    np.testing.assert_allclose(np.diag(absolute_fit.covariance)[known] ** 0.5, frame["std"][known])
     with pytest.raises(InputError, match=r"did you mean .*joint_compliance.j2"):
-        found.parameters["joint_complience.j2"]
+        absolute_fit.parameters["joint_complience.j2"]
 
 
-def test_residuals_in_base_axes_are_those_of_the_sensor_turned_back(found):
-    registered = se3.matrix(*se3.exp(found.theta[found.model.slices()[0]]))
-    assert found.model.names[0] == "base_frame"
-    turn = (found.model.cell.registration @ registered)[:3, :3]
-    np.testing.assert_allclose(found.residuals("base"), found.residuals() @ turn, atol=1e-15)
-    refusal("valid: sensor, base", found.residuals, "tool")
-    rows, r = found.whitening.reading, found.readings
-    added = found.predict(r.states).position[rows] + found.residuals()[:, :3]
+def test_residuals_in_base_axes_are_those_of_the_sensor_turned_back(absolute_fit):
+    registered = se3.matrix(*se3.exp(absolute_fit.theta[absolute_fit.model.slices()[0]]))
+    assert absolute_fit.model.names[0] == "base_frame"
+    turn = (absolute_fit.model.cell.registration @ registered)[:3, :3]
+    np.testing.assert_allclose(
+        absolute_fit.residuals("base"), absolute_fit.residuals() @ turn, atol=1e-15
+    )
+    refusal("valid: sensor, base", absolute_fit.residuals, "tool")
+    rows, r = absolute_fit.whitening.reading, absolute_fit.readings
+    added = absolute_fit.predict(r.states).position[rows] + absolute_fit.residuals()[:, :3]
     np.testing.assert_allclose(added, r.value[rows, :3], atol=1e-12)
 
 
@@ -268,9 +270,11 @@ def test_units_do_not_matter(mode, m, k):
     formal = a.uncertainty.formal  # ordinary magnitudes where there are none
     noise = np.where(formal > 0, formal, [p.scale for p in parameters])
     assert np.abs((b.theta / unit - a.theta) / noise).max() < 1e-5
-    seen = a.uncertainty.identifiable
-    np.testing.assert_array_equal(b.uncertainty.identifiable, seen)
-    np.testing.assert_allclose((b.uncertainty.std / unit)[seen], a.uncertainty.std[seen], rtol=1e-5)
+    identifiable = a.uncertainty.identifiable
+    np.testing.assert_array_equal(b.uncertainty.identifiable, identifiable)
+    np.testing.assert_allclose(
+        (b.uncertainty.std / unit)[identifiable], a.uncertainty.std[identifiable], rtol=1e-5
+    )
     assert b.rank == a.rank
     assert b.chi2 == pytest.approx(a.chi2, rel=1e-6)
     assert b.dof == pytest.approx(a.dof, rel=1e-6)
@@ -325,13 +329,13 @@ def test_where_loads_differ_the_compliances_are_right(mode):
 
 
 def test_without_the_weight_they_are_too_soft_and_that_is_said():
-    bare, told = (
+    bare, with_weight = (
         fitted_model(cell, C.readings, "absolute", ("joint_compliance",)) for cell in (BARE, C.cell)
     )
     assert ratios(bare).max() > 1.3
     assert "hilcal add RUN link_mass" in loads_note(bare)
-    assert ratios(told) == pytest.approx(1.0, abs=0.03)
-    assert loads_note(told) is None
+    assert ratios(with_weight) == pytest.approx(1.0, abs=0.03)
+    assert loads_note(with_weight) is None
 
 
 def test_forces_of_the_wrong_sign_are_said():
@@ -381,18 +385,18 @@ def case(seed, names, soft=5.0):
     return model, readings_at(q, value, wrench=states.wrench, pose=pose, load=load, std=SIGMA)
 
 
-def slope(found):
+def slope(fitted):
     """Difference quotient of ½ ‖r‖² by each z, where a unit of z moves all data by 1 σ."""
-    w = whitening(found.readings, "absolute")
-    steps = found.solution.equations.basis.transform
+    w = whitening(fitted.readings, "absolute")
+    steps = fitted.solution.equations.basis.transform
 
     def cost(theta):
-        p = found.model.predict(found.readings.states, theta)
-        return 0.5 * float(np.sum(w.whiten(residual(found.readings, p, w)) ** 2))
+        p = fitted.model.predict(fitted.readings.states, theta)
+        return 0.5 * float(np.sum(w.whiten(residual(fitted.readings, p, w)) ** 2))
 
     h = 0.05
     return np.array(
-        [(cost(found.theta + h * z) - cost(found.theta - h * z)) / (2 * h) for z in steps.T]
+        [(cost(fitted.theta + h * z) - cost(fitted.theta - h * z)) / (2 * h) for z in steps.T]
     )
 
 
@@ -402,11 +406,11 @@ def slope(found):
 )
 def test_a_misfit_does_not_hinder(seed, more):
     model, readings = case(seed, ("joint_compliance", "encoder_offset", *more))
-    found = fit(model, readings, "absolute")
-    assert found.solution.converged
-    assert found.solution.iterations <= STEPS
-    assert found.variance_factor > 3
-    np.testing.assert_allclose(slope(found), 0.0, atol=2e-3)
+    fitted = fit(model, readings, "absolute")
+    assert fitted.solution.converged
+    assert fitted.solution.iterations <= STEPS
+    assert fitted.variance_factor > 3
+    np.testing.assert_allclose(slope(fitted), 0.0, atol=2e-3)
 
 
 def test_directions_that_the_readings_hardly_determine_need_few_steps(ipa_ur10):
@@ -418,10 +422,10 @@ def test_directions_that_the_readings_hardly_determine_need_few_steps(ipa_ur10):
     model = baseline(cell, some, "absolute")
     for name in ("link_geometry", "link_compliance", "joint_tilt_compliance", "link_mass"):
         model = model + EffectSpec(name)
-    found = fit(model, some, "absolute")
-    assert found.solution.converged
-    assert found.solution.iterations <= 14
-    assert found.chi2 / 149_592 == pytest.approx(1.0, abs=1e-5)  # as by Gauss-Newton alone
+    fitted = fit(model, some, "absolute")
+    assert fitted.solution.converged
+    assert fitted.solution.iterations <= 14
+    assert fitted.chi2 / 149_592 == pytest.approx(1.0, abs=1e-5)  # as by Gauss-Newton alone
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -431,17 +435,17 @@ def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(s
     Under weights alone, along the axis of the first joint, they are one gauge freedom.
     """
     model, readings = case(seed, ("base_frame", "joint_compliance", "encoder_offset"))
-    found = fit(model, readings, "absolute")
+    fitted = fit(model, readings, "absolute")
     names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
     pair = [names.index("base_frame.rz"), names.index("encoder_offset.j1")]
-    assert found.solution.converged
-    assert found.solution.iterations <= STEPS
-    assert found.uncertainty.identifiable[pair].all()
+    assert fitted.solution.converged
+    assert fitted.solution.iterations <= STEPS
+    assert fitted.uncertainty.identifiable[pair].all()
     wrench = readings.states.wrench * [0, 0, 1, 0, 0, 0]
     states = replace(readings.states, wrench=wrench)
     shift = (
-        model.predict(states, found.theta).observation.position
-        - model.predict(readings.states, found.theta).observation.position
+        model.predict(states, fitted.theta).observation.position
+        - model.predict(readings.states, fitted.theta).observation.position
     )
     down = fit(model, replace(readings, states=states, value=readings.value + shift), "absolute")
     assert not down.uncertainty.identifiable[pair].any()
@@ -485,16 +489,16 @@ def test_errors_are_those_of_lapacks_qr(condition):
         assert squared > 1e3 * error
 
 
-def test_the_summary_has_every_parameter_and_both_errors(found):
-    text = found.summary()
-    assert all(f"{row.name} " in text for row in found.parameters)
-    for error in (found.error, found.holdout):
+def test_the_summary_has_every_parameter_and_both_errors(absolute_fit):
+    text = absolute_fit.summary()
+    assert all(f"{row.name} " in text for row in absolute_fit.parameters)
+    for error in (absolute_fit.error, absolute_fit.holdout):
         assert f"{1e6 * error.rms_m:.1f} µm rms" in text
 
 
-def test_the_summary_tells_a_family_in_short(found):
-    model = with_effects(found.model.cell, found.readings, found.mode, WAVES)
-    text = (fitted := fit(model, found.readings, found.mode)).summary()
+def test_the_summary_tells_a_family_in_short(absolute_fit):
+    model = with_effects(absolute_fit.model.cell, absolute_fit.readings, absolute_fit.mode, WAVES)
+    text = (fitted := fit(model, absolute_fit.readings, absolute_fit.mode)).summary()
     count = sum(row.name.startswith("transmission_error.") for row in fitted.parameters)
     assert f"transmission_error: {count} parameters, the largest:" in text
     assert text.count("transmission_error.") == 1

@@ -61,30 +61,30 @@ def shifted(readings, rows, shift):
 def test_three_gross_errors_are_set_aside_and_listed(mode, size):
     r, rows = C.readings, [7, 68, 134]
     assert not r.unloaded[rows].any()
-    found = fitted_model(C.cell, spoilt(r, rows, size), mode)
-    assert np.flatnonzero(found.outlier).tolist() == rows
+    fitted = fitted_model(C.cell, spoilt(r, rows, size), mode)
+    assert np.flatnonzero(fitted.outlier).tolist() == rows
     kept = r[np.delete(np.arange(150), rows)]
     clean = fitted_model(C.cell, kept, mode)
-    assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1e-4
-    assert found.chi2 == pytest.approx(clean.chi2, rel=1e-6)
-    assert found.dof == clean.dof
-    listed = outliers(found)
+    assert np.abs((fitted.theta - clean.theta) / clean.uncertainty.formal).max() < 1e-4
+    assert fitted.chi2 == pytest.approx(clean.chi2, rel=1e-6)
+    assert fitted.dof == clean.dof
+    listed = outliers(fitted)
     names = {(r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in rows}
     assert {(o["pose"], o["load"]) for o in listed} == names
     assert min(o["sigma"] for o in listed) > 5
     # No error of the fit counts them; those by which fits are compared do.
-    assert found.error.rms_m == pytest.approx(clean.error.rms_m, rel=1e-4)
-    assert found.holdout_of_all.max_m > 0.9 * size > 0.9 * found.holdout.max_m
+    assert fitted.error.rms_m == pytest.approx(clean.error.rms_m, rel=1e-4)
+    assert fitted.holdout_of_all.max_m > 0.9 * size > 0.9 * fitted.holdout.max_m
 
 
 def test_a_gross_error_of_an_unloaded_reading_takes_its_deflections_along():
     assert C.readings.unloaded[45]
-    found = fitted_model(C.cell, spoilt(C.readings, [45], 5e-3), "deflection")
+    fitted = fitted_model(C.cell, spoilt(C.readings, [45], 5e-3), "deflection")
     clean = fitted_model(C.cell, C.readings, "deflection")
-    assert set(C.readings.pose[found.outlier]) == {C.readings.pose[45]}
+    assert set(C.readings.pose[fitted.outlier]) == {C.readings.pose[45]}
     # Four of 120 deflections less.
-    assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1.5
-    (listed,) = outliers(found)
+    assert np.abs((fitted.theta - clean.theta) / clean.uncertainty.formal).max() < 1.5
+    (listed,) = outliers(fitted)
     assert listed["load"] == "none"
     assert "its 4 deflections set aside with it" in listed["reason"]
     assert listed["sigma"] > 50
@@ -99,8 +99,8 @@ def test_gross_errors_say_what_they_look_like(mode):
     value[far, 2] += 2e-3
     value[stale] = value[stale - 1]
     value[bare] = value[30] + 1e-6
-    found = outliers(fitted_model(C.cell, replace(r, value=value), mode))
-    listed = {(o["pose"], o["load"]): o["reason"] for o in found}
+    set_aside = outliers(fitted_model(C.cell, replace(r, value=value), mode))
+    listed = {(o["pose"], o["load"]): o["reason"] for o in set_aside}
     reasons = [listed[r.pose_names[r.pose[k]], r.load_names[r.load[k]]] for k in (far, stale, bare)]
     assert len(listed) == 3
     assert reasons[0].endswith("σ off in z")
@@ -221,7 +221,7 @@ def test_all_of_many_gross_errors_are_found(share, size, mode, m):
     c = twelve(mode, m=m)
     r = c.readings
     readings, wrong = spoil(r, share, size, np.random.default_rng(0))
-    found = fitted_model(c.cell, readings, mode)
+    fitted = fitted_model(c.cell, readings, mode)
     # The same as without them; deflections go with their unloaded reading.
     out = np.isin(np.arange(len(readings)), wrong)
     if mode == "deflection":
@@ -229,19 +229,19 @@ def test_all_of_many_gross_errors_are_found(share, size, mode, m):
         out |= ~np.isin(r.pose, r.pose[~out & ~r.unloaded])
     right = fitted_model(c.cell, r[~out], mode)
     out[np.flatnonzero(~out)[right.outlier]] = True
-    np.testing.assert_array_equal(found.outlier, out)
+    np.testing.assert_array_equal(fitted.outlier, out)
     if m == 3:  # the target's axes, which attitudes show, are those of the registration
-        assert found.variance_factor == pytest.approx(right.variance_factor, rel=0.1)
+        assert fitted.variance_factor == pytest.approx(right.variance_factor, rel=0.1)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("seed", "share"), [(13, 0.4), (22, 0.4), (24, 0.4), (33, 0.4), (5, 0.2)])
 def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed, share):
     """24 to 180 readings, nothing or an unmodelled effect of 10 to 20 σ."""
-    found = count(CONFIG, GrossErrorCase(share, 5e-3, seed))
-    assert found.found == found.wrong
-    assert found.false <= 0.01 * found.readings
-    assert found.outcome != "refused"
+    counts = count(CONFIG, GrossErrorCase(share, 5e-3, seed))
+    assert counts.found == counts.wrong
+    assert counts.false <= 0.01 * counts.readings
+    assert counts.outcome != "refused"
 
 
 @pytest.mark.long
@@ -249,10 +249,10 @@ def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed, share):
 def test_more_than_can_be_told_is_said(mode):
     c = twelve(mode)
     readings, _ = spoil(c.readings, 0.6, 5e-3, np.random.default_rng(0))
-    found = refined(c.cell, readings, mode)
-    assert found.verdict == "unknown_effect"
-    assert "More than 45 % of the readings disagree" in message(found.diagnosis)
-    assert not found.fit.outlier.any()
+    refinement = refined(c.cell, readings, mode)
+    assert refinement.verdict == "unknown_effect"
+    assert "More than 45 % of the readings disagree" in message(refinement.diagnosis)
+    assert not refinement.fit.outlier.any()
 
 
 @pytest.mark.parametrize(
@@ -266,9 +266,9 @@ def test_readings_that_follow_the_state_are_not_called_wrong(kind, size, angle, 
     r = C.readings[C.readings.pose < 20] if every else C.readings[C.readings.unloaded]
     value = r.value.copy()
     value[:, 1] += size * angle(r.states.q)
-    found = fitted_model(C.cell, replace(r, value=value), "absolute")
-    assert found.disagreement.kind == kind
-    d = diagnose(found)
+    fitted = fitted_model(C.cell, replace(r, value=value), "absolute")
+    assert fitted.disagreement.kind == kind
+    d = diagnose(fitted)
     assert (d.verdict, d.reason) == ("unknown_effect", "no_suspect")
     assert d.follows[0] in message(d)
 
@@ -281,31 +281,31 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
         model = baseline(c.cell, c.readings, "absolute")
         axes = model.predict(c.readings.states, np.zeros(model.size)).observation.rotation
         shift = axes[rows] @ shift
-    found = fitted_model(c.cell, shifted(c.readings, rows, shift), "absolute")
-    assert not found.outlier.any()
-    np.testing.assert_array_equal(found.disagreement.rows, np.arange(12, 30))
-    assert any("are off by the same shift" in note for note in notes(found))
+    fitted = fitted_model(c.cell, shifted(c.readings, rows, shift), "absolute")
+    assert not fitted.outlier.any()
+    np.testing.assert_array_equal(fitted.disagreement.rows, np.arange(12, 30))
+    assert any("are off by the same shift" in note for note in notes(fitted))
 
 
 def test_a_block_is_not_taken_for_random_errors_among_such():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.1, 5e-3, np.random.default_rng(1))
-    found = fitted_model(
+    fitted = fitted_model(
         c.cell, shifted(readings, slice(20, 32), np.array([0, 0, -8e-3])), "absolute"
     )
     inside = (wrong >= 20) & (wrong < 32)
-    assert found.outlier[wrong[~inside]].all()
-    assert found.disagreement is not None
-    assert found.outlier[20:32].sum() <= inside.sum()
+    assert fitted.outlier[wrong[~inside]].all()
+    assert fitted.disagreement is not None
+    assert fitted.outlier[20:32].sum() <= inside.sum()
 
 
 def test_an_unloaded_reading_that_several_deflections_share():
     c = twelve("deflection")
     rows, value = np.flatnonzero(c.readings.unloaded)[::4], c.readings.value.copy()
     value[rows] += 5e-3 * np.random.default_rng(0).normal(size=(len(rows), 3))
-    found = fitted_model(c.cell, replace(c.readings, value=value), "deflection")
+    fitted = fitted_model(c.cell, replace(c.readings, value=value), "deflection")
     expected = np.isin(c.readings.pose, c.readings.pose[rows])
-    np.testing.assert_array_equal(found.outlier, expected)
+    np.testing.assert_array_equal(fitted.outlier, expected)
 
 
 @pytest.mark.parametrize("mode", first(1, MODES))
@@ -318,10 +318,10 @@ def test_readings_of_several_targets(mode):
 def test_a_registration_does_not_follow_errors_of_centimetres():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.4, 5e-2, np.random.default_rng(0))
-    found = register(c.cell, readings)
-    np.testing.assert_array_equal(np.flatnonzero(found.far), np.sort(wrong))
-    assert found.rms < 1.1 * register(c.cell, c.readings).rms + 1e-4
-    finding = examine(found, readings)
+    registered = register(c.cell, readings)
+    np.testing.assert_array_equal(np.flatnonzero(registered.far), np.sort(wrong))
+    assert registered.rms < 1.1 * register(c.cell, c.readings).rms + 1e-4
+    finding = examine(registered, readings)
     assert not finding.refused
 
 
@@ -380,18 +380,18 @@ def one_sided(model, readings, size, joint):
 def test_a_law_of_one_joint_is_not_set_aside(joint):
     c = twelve("deflection")
     model = baseline(c.cell, c.readings, "deflection")
-    found = fit(model, one_sided(model, c.readings, 1e-3, joint), "deflection")
-    assert not found.outlier.any()
+    fitted = fit(model, one_sided(model, c.readings, 1e-3, joint), "deflection")
+    assert not fitted.outlier.any()
 
 
 def test_gross_errors_beside_such_a_law_are_found():
     c = twelve("deflection")
     model = baseline(c.cell, c.readings, "deflection")
     r, wrong = spoil(one_sided(model, c.readings, 60e-6, 1), 0.2, 5e-3, np.random.default_rng(0))
-    found = fit(model, r, "deflection")
-    assert found.outlier[wrong].mean() >= 0.95
+    fitted = fit(model, r, "deflection")
+    assert fitted.outlier[wrong].mean() >= 0.95
     lost = np.isin(r.pose, r.pose[wrong[r.unloaded[wrong]]])  # with their unloaded reading
-    assert not found.outlier[~lost & ~np.isin(np.arange(len(r)), wrong)].any()
+    assert not fitted.outlier[~lost & ~np.isin(np.arange(len(r)), wrong)].any()
 
 
 def random_model(mode, rng):
@@ -416,7 +416,7 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode):
     rng = np.random.default_rng(1)
     of = random_model(mode, rng)
     used = of.tested & (rng.random(len(of)) < 0.7)
-    found, groups = of.distances(used), len(of.members)
+    distances, groups = of.distances(used), len(of.members)
     offsets = np.zeros((len(of), 3, 3 * groups))
     for k in np.flatnonzero(of.group >= 0):
         offsets[k, :, 3 * of.group[k] : 3 * of.group[k] + 3] = of.root[k]
@@ -430,7 +430,7 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode):
         delta = c @ (rows.T @ of.residual[rest].reshape(-1) - pull)
         off = of.residual[k] - b[k] @ delta
         exact = off @ np.linalg.solve(np.eye(3) + b[k] @ c @ b[k].T, off)
-        assert found[k] == pytest.approx(exact, rel=1e-6)
+        assert distances[k] == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.parametrize("m", [3, 6])
@@ -438,10 +438,10 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode):
 def test_a_step_of_the_linear_model_is_that_of_the_fit(mode, m):
     """At the minimum of a fit the step is zero, deflections through their offset as well."""
     c = campaign("none", mode, poses=12, m=m)
-    found = fitted_model(c.cell, c.readings, mode)
-    y = found.solution.y
-    of = linearised(DataSnooping(found.model, c.readings, mode, found.solution, y), y).linear
+    fitted = fitted_model(c.cell, c.readings, mode)
+    y = fitted.solution.y
+    of = linearised(DataSnooping(fitted.model, c.readings, mode, fitted.solution, y), y).linear
     assert np.abs(of.columns @ of.fitted(of.tested)).max() < 1e-2  # standard deviations of noise
     left = of.residuals(of.tested)
-    assert np.sum(left**2) == pytest.approx(found.chi2, rel=1e-3)
+    assert np.sum(left**2) == pytest.approx(fitted.chi2, rel=1e-3)
     assert len(whitening(c.readings, mode)) == np.count_nonzero(of.tested) - len(of.members)

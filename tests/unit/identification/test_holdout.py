@@ -49,29 +49,29 @@ SLOW = [
 
 @pytest.mark.parametrize(("mode", "m"), [("absolute", 6), ("deflection", 3), *SLOW])
 def test_leaving_out_is_refitting_without(mode, m):
-    found = fitted(mode, m)
-    readings, w, model = found.readings, found.whitening, found.model
-    assert not found.outlier.any()
-    fold, of_reading = random_folds(found.pose), random_folds(distinct_poses(readings))
-    solution = solve(model, readings, w, found.theta)
+    result = fitted(mode, m)
+    readings, w, model = result.readings, result.whitening, result.model
+    assert not result.outlier.any()
+    fold, of_reading = random_folds(result.pose), random_folds(distinct_poses(readings))
+    solution = solve(model, readings, w, result.theta)
     left_out = leave_out(model, solution, fold, w)
-    np.testing.assert_allclose(left_out, found.left_out, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(left_out, result.left_out, rtol=0, atol=1e-9)
     changed = parameter_changes(model, solution, fold, w)
     assert len(changed) == 10
-    noise, sigma = found.uncertainty.formal, np.sqrt(np.einsum("dii->di", w.covariance))
-    known = ordinary_magnitudes(model, found.theta)
+    noise, sigma = result.uncertainty.formal, np.sqrt(np.einsum("dii->di", w.covariance))
+    known = ordinary_magnitudes(model, result.theta)
     prior = np.where(np.isinf(solution.prior), known, solution.prior)
     moved = []
     for f, change in enumerate(changed):
         rest = readings[of_reading != f]
-        refit = fit(model, rest, mode, start=found.theta, prior=prior)
+        refit = fit(model, rest, mode, start=result.theta, prior=prior)
         # One linear step: right to a few per cent of a standard uncertainty, where leaving out
         # moves parameters by one.
-        np.testing.assert_allclose(change / noise, (refit.theta - found.theta) / noise, atol=0.06)
+        np.testing.assert_allclose(change / noise, (refit.theta - result.theta) / noise, atol=0.06)
         off = residual(readings, model.predict(readings.states, refit.theta), w)
         out = fold == f
         np.testing.assert_allclose((left_out - off)[out] / sigma[out], 0, atol=0.02)
-        moved.append((found.raw - off)[out] / sigma[out])
+        moved.append((result.raw - off)[out] / sigma[out])
     assert np.abs(np.concatenate(moved)).max() > 0.3
 
 
@@ -121,10 +121,10 @@ def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others():
     config = configuration()
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
     before = fitted_model(c.cell, c.readings, "deflection")
-    found = add(before, "backlash")
-    assert found.variance_factor == pytest.approx(1.0, abs=0.15)
-    assert found.holdout.rms_sigma < 1.1 < 1.5 < before.holdout.rms_sigma
-    assert predicts_better(before, found)
+    after = add(before, "backlash")
+    assert after.variance_factor == pytest.approx(1.0, abs=0.15)
+    assert after.holdout.rms_sigma < 1.1 < 1.5 < before.holdout.rms_sigma
+    assert predicts_better(before, after)
 
 
 @pytest.mark.parametrize("seed", [1, 3])
@@ -142,8 +142,8 @@ def test_scatter_beyond_the_stated_noise_is_told_from_what_many_parameters_take(
     r = replace(r, value=r.value + more)
     names = ("joint_compliance", "transmission_error")
     options = {"transmission_error": {"harmonics": 12}}
-    found = fit(with_effects(c.cell, r, "absolute", names, options), r, "absolute")
-    p = predictive_of(found)
+    result = fit(with_effects(c.cell, r, "absolute", names, options), r, "absolute")
+    p = predictive_of(result)
     assert p.excess.attitude == 1.0
     assert scatter / 2 < np.sqrt(p.excess.position) < scatter * 2
     assert p.noise < 1.2
@@ -187,10 +187,10 @@ def drawn(extra_m, factor, parameters=0):
     [(0.0, 1.0, 0), (30e-6, 1.0, 0), (0.0, 3.0, 0), (30e-6, 2.0, 0), (30e-6, 2.0, 300)],
 )
 def test_an_excess_is_found_in_its_size_and_its_part(extra_m, factor, parameters):
-    found, _ = drawn(extra_m, factor, parameters)
+    estimate, _ = drawn(extra_m, factor, parameters)
     # 1200 elements: good to 1/sqrt(600).
-    assert np.sqrt(found.position) == pytest.approx(extra_m, rel=0.08)
-    assert found.attitude == (1.0 if factor == 1.0 else pytest.approx(factor, rel=0.15))
+    assert np.sqrt(estimate.position) == pytest.approx(extra_m, rel=0.08)
+    assert estimate.attitude == (1.0 if factor == 1.0 else pytest.approx(factor, rel=0.15))
 
 
 def test_a_deflection_has_it_once():
@@ -214,22 +214,22 @@ def split(seed, joint):
     first = np.random.default_rng(seed).permutation(len(r)) < len(r) // 2
     if joint is not None:
         first = r.states.q[:, joint] < np.median(r.states.q[:, joint])
-    found = fitted_model(c.cell, r[first], "absolute", ("joint_compliance", "transmission_error"))
-    other = validate(found.model, found.theta, found.readings, r[~first], "absolute")
-    return found, other, extrapolation(predictive_of(found), found.readings, other)
+    result = fitted_model(c.cell, r[first], "absolute", ("joint_compliance", "transmission_error"))
+    other = validate(result.model, result.theta, result.readings, r[~first], "absolute")
+    return result, other, extrapolation(predictive_of(result), result.readings, other)
 
 
 def test_several_loads_at_a_pose_do_not_make_fresh_poses_outside():
     c = campaign("transmission_error", "absolute", 0, plan_seed=5, poses=50, strength=3.0)
     fitted = c.readings.pose % 2 == 0
-    found = fitted_model(
+    result = fitted_model(
         c.cell, c.readings[fitted], "absolute", ("joint_compliance", "transmission_error")
     )
     fresh = c.readings[~fitted]
-    other = validate(found.model, found.theta, found.readings, fresh, "absolute")
-    by_pose = extrapolation(predictive_of(found), found.readings, other).variables
+    other = validate(result.model, result.theta, result.readings, fresh, "absolute")
+    by_pose = extrapolation(predictive_of(result), result.readings, other).variables
     assert not any(v.variable == POSITION_STD and v.count > 0.1 * len(fresh) for v in by_pose)
-    points = Calibration.of(found).predict(fresh.states.q, fresh.states.wrench)
+    points = Calibration.of(result).predict(fresh.states.q, fresh.states.wrench)
     alone = [o for o in points.outside if o.range.variable == POSITION_STD]
     assert not any(o.points.mean() > 0.1 for o in alone)
 
@@ -242,14 +242,14 @@ def rms(z):
 def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint):
     z = []
     for seed in range(2):
-        found, other, x = split(seed, joint)
+        result, other, x = split(seed, joint)
         assert x.outside.mean() > 0.9
         lead = x.variables[0]
         assert (lead.variable, lead.unit) == (f"joint {joint + 1} angle", "rad")
         q = other.readings.states.q[:, joint]
         either_way = np.minimum(q - lead.high, lead.low + 2 * np.pi - q)  # whole turns are the same
         assert lead.most == pytest.approx(either_way.max())
-        assert rms(x.stated_m[x.outside]) > 1.2 * found.holdout.rms_m
+        assert rms(x.stated_m[x.outside]) > 1.2 * result.holdout.rms_m
         z.append(rms(x.z))
     assert 0.5 < rms(np.array(z)) < 1.15
 
@@ -257,10 +257,10 @@ def test_half_against_half_of_a_joint_is_outside_and_its_error_is_stated(joint):
 def test_of_two_random_halves_few_are_outside():
     z = []
     for seed in range(2):
-        found, other, x = split(seed, None)
+        result, other, x = split(seed, None)
         assert x.outside.mean() < 0.1
         assert x.inside_error.rms_m == pytest.approx(other.error.rms_m, rel=0.1)
-        assert other.error.rms_sigma < 1.2 * found.holdout.rms_sigma
+        assert other.error.rms_sigma < 1.2 * result.holdout.rms_sigma
         z.append(rms(x.z))
     assert 0.6 < rms(np.array(z)) < 1.1
 
@@ -277,17 +277,17 @@ def test_waves_of_whole_turns_are_the_same_and_couplings_are_not(effect, same):
 
 def test_a_joint_that_turned_on_is_validated_as_inside():
     c = campaign(poses=16)
-    found = fitted_model(c.cell, c.readings, "absolute")
+    result = fitted_model(c.cell, c.readings, "absolute")
     q = c.readings.states.q.copy()
     q[:, 5] += 2 * np.pi
     on = replace(c.readings, states=replace(c.readings.states, q=q))
-    seen = validate(found.model, found.theta, c.readings, on, "absolute")
-    told = extrapolation(predictive_of(found), c.readings, seen)
-    assert not any("angle" in v.variable for v in told.variables)
+    validation = validate(result.model, result.theta, c.readings, on, "absolute")
+    beyond = extrapolation(predictive_of(result), c.readings, validation)
+    assert not any("angle" in v.variable for v in beyond.variables)
 
 
 def test_a_tracker_set_up_anew_has_the_same_stated_errors_wherever_it_stands():
-    found, other, _ = split(0, 1)  # its other half is outside: errors of the prediction count
+    result, other, _ = split(0, 1)  # its other half is outside: errors of the prediction count
     z = []
     for turn in (np.eye(3), se3.rotation(np.array([0.3, -1.2, 0.8]))):
         r = other.readings
@@ -296,8 +296,8 @@ def test_a_tracker_set_up_anew_has_the_same_stated_errors_wherever_it_stands():
             value=r.value[:, :3] @ turn.T + np.array([0.2, -0.4, 0.1]),
             covariance=turn @ r.covariance[:, :3, :3] @ turn.T,
         )
-        p = set_up_anew(predictive_of(found), found.readings, moved, "absolute")
-        seen = validate(p.model, p.theta, found.readings, moved, "absolute", registered=True)
-        z.append(extrapolation(p, found.readings, seen).z)
+        p = set_up_anew(predictive_of(result), result.readings, moved, "absolute")
+        validation = validate(p.model, p.theta, result.readings, moved, "absolute", registered=True)
+        z.append(extrapolation(p, result.readings, validation).z)
     np.testing.assert_allclose(z[1], z[0], rtol=1e-3)
     assert rms(z[0]) < 1.15

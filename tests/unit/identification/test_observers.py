@@ -48,11 +48,13 @@ def fitted(c, mode="absolute", readings=None):
     return fitted_model(c.cell, with_joint_scatter(c.cell, given, joint_std), mode)
 
 
-def apart(c, found):
+def apart(c, result):
     """Errors of the compliances over their standard uncertainties."""
     truth = true_parameters(c.world, "joint_compliance")
-    told = [v for k, v in parameters_by_effect(found).items() if k.startswith("joint_compliance")]
-    return np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
+    estimates = [
+        v for k, v in parameters_by_effect(result).items() if k.startswith("joint_compliance")
+    ]
+    return np.array([(value - t) / std for (value, std), t in zip(estimates, truth, strict=True)])
 
 
 @pytest.mark.parametrize("moved", [0.0, 20.0])
@@ -83,12 +85,12 @@ def test_jacobian_is_the_derivative_of_the_prediction(moved):
 @pytest.mark.parametrize("case", first(1, list(CASES)))
 def test_true_parameters_lie_in_their_bands_and_residuals_are_noise(case, mode):
     who, kept = CASES[case]
-    found = [(c := observed(who, seed, **kept), fitted(c, mode)) for seed in range(12)]
-    z = np.array([apart(c, f) for c, f in found])
+    fits = [(c := observed(who, seed, **kept), fitted(c, mode)) for seed in range(12)]
+    z = np.array([apart(c, f) for c, f in fits])
     # 72 errors of about a third as many independent ones: their rms scatters by 0.12.
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
-    assert 0.9 < np.mean([f.variance_factor for _, f in found]) < 1.1
-    assert sum(int(f.outlier.sum()) for _, f in found) == 0
+    assert 0.9 < np.mean([f.variance_factor for _, f in fits]) < 1.1
+    assert sum(int(f.outlier.sum()) for _, f in fits) == 0
 
 
 @pytest.mark.parametrize("case", first(1, list(CASES)))
@@ -131,9 +133,9 @@ def test_fresh_readings_are_predicted_to_their_noise():
     centre = np.array([POINTS[r.observers[k].name] for k in r.observer])
     value, noise = r.value.copy(), np.random.default_rng(1).standard_normal(len(r))
     value[:, 0] = np.linalg.norm(at - centre, axis=1) + 1e-5 * noise
-    found = validate(f.model, f.theta, f.readings, replace(r, value=value), "absolute")
-    assert found.readings.observers == c.readings.observers
-    assert found.error.rms_m < 3e-5
+    validation = validate(f.model, f.theta, f.readings, replace(r, value=value), "absolute")
+    assert validation.readings.observers == c.readings.observers
+    assert validation.error.rms_m < 3e-5
     other = observed(["A", "D"], 6, base=True).readings
     with pytest.raises(InputError, match="point D observed these readings, but not those"):
         validate(f.model, f.theta, f.readings, other, "absolute")
@@ -145,8 +147,8 @@ def test_a_bar_of_unknown_length():
     value = c.readings.value.copy()
     value[c.readings.scalar, 0] += 0.123
     f = fitted(c, readings=replace(c.readings, value=value))
-    found, std = parameters_by_effect(f)["observer_frame.A.offset"]
-    offset = f.model.cell.observers[1].offset + found
+    correction, std = parameters_by_effect(f)["observer_frame.A.offset"]
+    offset = f.model.cell.observers[1].offset + correction
     assert abs(offset - 0.123) < 4 * std
     assert std < 1e-3
     assert 0.8 < f.variance_factor < 1.25
@@ -165,8 +167,8 @@ def test_a_direction_that_is_known():
 @pytest.mark.long
 def test_what_distances_do_not_tell_is_named():
     c = observed(["A", "B"], 1, cell=base_cell(stated("AB")))
-    found = register(c.cell, c.readings)
-    (line,) = undetermined_lines(found)
+    registered = register(c.cell, c.readings)
+    (line,) = undetermined_lines(registered)
     assert "the base's" in line
     assert "turn about its direction" in line
     f = fitted(c)
@@ -237,10 +239,10 @@ def test_stations_of_poses():
     cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
     readings = replace(whole, states=states, value=value, covariance=cov, observers=names)
     cell = cell_of(target_known=False)
-    found, one = (fitted_model(cell, r, "absolute") for r in (readings, whole))
-    assert found.dof == one.dof - 6
+    two, one = (fitted_model(cell, r, "absolute") for r in (readings, whole))
+    assert two.dof == one.dof - 6
     assert abs(one.variance_factor - 1.0) < 0.3
-    assert abs(found.variance_factor - 1.0) < 0.3
+    assert abs(two.variance_factor - 1.0) < 0.3
 
 
 def test_a_cell_names_its_gauges(tmp_path):

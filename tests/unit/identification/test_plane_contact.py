@@ -45,9 +45,9 @@ def placed(cell, name, rng):
         )
 
     while True:
-        found = least_squares(off, rng.uniform(-2, 2, 6), max_nfev=60)
-        q = np.asarray((found.x + np.pi) % (2 * np.pi) - np.pi)
-        if found.cost < 1e-16:
+        solution = least_squares(off, rng.uniform(-2, 2, 6), max_nfev=60)
+        q = np.asarray((solution.x + np.pi) % (2 * np.pi) - np.pi)
+        if solution.cost < 1e-16:
             return q
 
 
@@ -116,15 +116,15 @@ def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(plates, effe
     names, z, factors = ["joint_compliance", *[effect] * bool(effect)], [], []
     for seed in range(8):
         cell, world, readings = touched(CASES[plates], 30, seed, effect)
-        found = fitted(cell, readings, effect)
-        told = parameters_by_effect(found)
+        result = fitted(cell, readings, effect)
+        estimates = parameters_by_effect(result)
         truth = np.concatenate([true_parameters(world, name) for name in names])
-        of = np.array([v for k, v in told.items() if k.startswith(tuple(names))])
+        of = np.array([v for k, v in estimates.items() if k.startswith(tuple(names))])
         free = np.isfinite(of[:, 1])
         assert np.flatnonzero(~free).tolist() == [0, 6][: len(names)]  # those of joint 1
         z.append(((of[:, 0] - truth) / of[:, 1])[free])
-        factors.append(found.variance_factor)
-        assert not found.outlier.any()
+        factors.append(result.variance_factor)
+        assert not result.outlier.any()
     # 40 or 80 errors of about half as many independent ones: their rms scatters by 0.16 or less.
     assert 0.55 < np.sqrt(np.mean(np.square(z))) < 1.45
     assert 0.8 < np.mean(factors) < 1.2  # eight of 80 degrees of freedom or more: 0.055

@@ -45,36 +45,36 @@ def fitted(*names):
     return fitted_model(c.cell, c.readings, "absolute", names)
 
 
-def places(found, p):
+def places(result, p):
     """Where the parameters of a posterior are in a fit."""
-    names = [f"{e.name}.{q.name}" for e in found.model.effects for q in e.parameters]
+    names = [f"{e.name}.{q.name}" for e in result.model.effects for q in e.parameters]
     return [names.index(n) for n in p.names]
 
 
 def test_the_setup_is_marginalised_out_and_a_misfit_widens_what_is_stated():
     """The geometry is missing in this model."""
-    found = fitted("joint_compliance", "encoder_offset")
-    assert {"base_frame", "target_offset"} < set(found.model.names)
-    p = Posterior.of(found, Source("a.hilcal", 3))
+    result = fitted("joint_compliance", "encoder_offset")
+    assert {"base_frame", "target_offset"} < set(result.model.names)
+    p = Posterior.of(result, Source("a.hilcal", 3))
     assert [e.name for e in p.effects] == ["joint_compliance", "encoder_offset"]
     # The whole covariance's part is the inverse of the Schur complement of the whole information:
     # that of a fit to readings whose noise has the misfit.
-    used, s, rows = found.readings, found.solution, places(found, p)
-    left_out = found.holdout.rms_sigma
-    more = predictive(found.model, s.theta, s.prior, used, "absolute", left_out).excess
+    used, s, rows = result.readings, result.solution, places(result, p)
+    left_out = result.holdout.rms_sigma
+    more = predictive(result.model, s.theta, s.prior, used, "absolute", left_out).excess
     assert more.position > 0
-    wide = fit(found.model, more.of_readings(used, "absolute"), "absolute", start=s.theta)
-    seen = np.isfinite(p.std)
-    ratio = p.std[seen] / wide.uncertainty.formal[rows][seen]
+    wide = fit(result.model, more.of_readings(used, "absolute"), "absolute", start=s.theta)
+    known = np.isfinite(p.std)
+    ratio = p.std[known] / wide.uncertainty.formal[rows][known]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
     assert ratio[0] > 1.0
     # A joint's zero that a turn of the base or the target hides is not known.
-    assert not seen[p.index("encoder_offset")].all()
-    assert seen[p.index("joint_compliance")].all()
-    assert p.source.n_readings == len(found.readings)
-    assert found.variance_factor > 1.2**2
-    plain = np.sqrt(found.variance_factor) * found.uncertainty.formal[rows]
-    assert (p.std[seen] > plain[seen]).all()
+    assert not known[p.index("encoder_offset")].all()
+    assert known[p.index("joint_compliance")].all()
+    assert p.source.n_readings == len(result.readings)
+    assert result.variance_factor > 1.2**2
+    plain = np.sqrt(result.variance_factor) * result.uncertainty.formal[rows]
+    assert (p.std[known] > plain[known]).all()
 
 
 def test_it_comes_back_exactly(tmp_path):
@@ -101,10 +101,10 @@ def test_what_was_not_determined_has_no_information():
 
 
 def test_a_harmonic_that_was_dropped_is_not_known_to_be_zero():
-    found = fitted("joint_compliance", "transmission_error")
-    family = found.model.slices()[found.model.names.index("transmission_error")]
-    dropped = np.flatnonzero(found.solution.prior[family] == 0)
-    p = Posterior.of(found)
+    result = fitted("joint_compliance", "transmission_error")
+    family = result.model.slices()[result.model.names.index("transmission_error")]
+    dropped = np.flatnonzero(result.solution.prior[family] == 0)
+    p = Posterior.of(result)
     std = p.std[p.index("transmission_error")][dropped]
     assert len(std)
     assert ((std > 0) & np.isfinite(std)).all()
@@ -156,13 +156,13 @@ def posterior(arm, seed, zero3=0.0):
 
 def test_two_campaigns_of_an_unchanged_arm_differ_by_their_uncertainty(arm):
     p = [posterior(arm, k) for k in range(8)]
-    found = [parameter_differences(*pair) for pair in zip(p[::2], p[1::2], strict=True)]
-    z = np.array([r.z for d in found for r in d.rows if r.z is not None])
+    differences = [parameter_differences(*pair) for pair in zip(p[::2], p[1::2], strict=True)]
+    z = np.array([r.z for d in differences for r in d.rows if r.z is not None])
     assert len(z) >= 40
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
-    assert min(e.p_value for d in found for e in d.effects) > 1e-3
+    assert min(e.p_value for d in differences for e in d.effects) > 1e-3
     # A zero that the tracker's place absorbs is not compared.
-    of = {r.name: r.z for r in found[0].rows}
+    of = {r.name: r.z for r in differences[0].rows}
     assert of["encoder_offset.j1"] is None
     assert of["encoder_offset.j3"] is not None
 
@@ -201,19 +201,19 @@ def with_prior(readings, prior):
 def test_a_prior_and_new_readings_are_as_all_readings_together():
     p, together, alone = learnt(), of_poses(0, 40), of_poses(25, 40)
     still = replace(carried_prior(p), expected={e.name: 1e-9 for e in p.effects})  # no drift
-    found, std = of_poses(25, 40, still), together.uncertainty.formal
+    result, std = of_poses(25, 40, still), together.uncertainty.formal
     # The posterior is wider by what its own poses left out were off, here 1.1.
-    np.testing.assert_allclose(found.uncertainty.formal, std, rtol=0.1)
-    assert np.abs((found.theta - together.theta) / std).max() < 0.5
-    assert found.dof > alone.dof + 5
-    assert found.holdout.rms_m < alone.holdout.rms_m
+    np.testing.assert_allclose(result.uncertainty.formal, std, rtol=0.1)
+    assert np.abs((result.theta - together.theta) / std).max() < 0.5
+    assert result.dof > alone.dof + 5
+    assert result.holdout.rms_m < alone.holdout.rms_m
 
     def correlation(of):
         covariance = covariance_of(of)
         std = np.sqrt(np.diag(covariance))
         return np.asarray(covariance / std / std[:, None])
 
-    np.testing.assert_allclose(correlation(found), correlation(together), atol=0.1)
+    np.testing.assert_allclose(correlation(result), correlation(together), atol=0.1)
 
 
 def test_the_order_of_the_effects_of_a_prior_does_not_matter():
@@ -223,7 +223,7 @@ def test_the_order_of_the_effects_of_a_prior_does_not_matter():
     one, other = (fit(model, r, "absolute") for model in models)
     assert one.model.names != other.model.names
     assert one.chi2 == pytest.approx(other.chi2, rel=1e-3)
-    of = [{p.name: p.value for p in found.parameters} for found in (one, other)]
+    of = [{p.name: p.value for p in result.parameters} for result in (one, other)]
     assert of[1] == pytest.approx(of[0], abs=1e-9)
 
 
@@ -235,22 +235,22 @@ def test_few_readings_tell_which_link_of_a_prior_has_moved():
     zeros = physics.encoder_offset + 1.2e-3 * np.eye(6)[2]
     slipped = replace(arm.world, physics=physics.with_effect("encoder_offset", zeros))
     r = remeasured(slipped, arm.loads, 15, np.random.default_rng(2))
-    found = fit(baseline(arm.cell, r, "absolute", prior=prior), r, "absolute")
-    assert found.conflicts[0].group.part == "link3"
-    assert found.conflicts[0].moved_sigma > 10
-    assert found.variance_factor < 3
+    result = fit(baseline(arm.cell, r, "absolute", prior=prior), r, "absolute")
+    assert result.conflicts[0].group.part == "link3"
+    assert result.conflicts[0].moved_sigma > 10
+    assert result.variance_factor < 3
 
 
 def test_a_prior_that_knows_nothing_changes_nothing():
     p, alone = learnt(), of_poses(25, 40)
     nothing = replace(p, information=np.zeros_like(p.information))
-    found = of_poses(25, 40, carried_prior(nothing))
-    np.testing.assert_allclose(found.theta, alone.theta, rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(found.uncertainty.std, alone.uncertainty.std, rtol=1e-9)
-    assert found.chi2 == pytest.approx(alone.chi2, rel=1e-9)
-    assert found.dof == pytest.approx(alone.dof, rel=1e-12)
+    result = of_poses(25, 40, carried_prior(nothing))
+    np.testing.assert_allclose(result.theta, alone.theta, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(result.uncertainty.std, alone.uncertainty.std, rtol=1e-9)
+    assert result.chi2 == pytest.approx(alone.chi2, rel=1e-9)
+    assert result.dof == pytest.approx(alone.dof, rel=1e-12)
     # Without a fold flat parameters shrink: towards zero, or the mean of the prior.
-    assert found.holdout.rms_m == pytest.approx(alone.holdout.rms_m, rel=1e-3)
+    assert result.holdout.rms_m == pytest.approx(alone.holdout.rms_m, rel=1e-3)
 
 
 @cache
@@ -264,21 +264,21 @@ def repaired():
 
 
 def test_the_joint_that_moved_is_found_and_let_go():
-    found = repaired()
-    worst = found.conflicts[0]
+    result = repaired()
+    worst = result.conflicts[0]
     assert (worst.group.effect, worst.group.joint) == ("joint_compliance", 3)
     assert worst.moved_sigma > 6
     assert worst.drift > 0.1
-    assert found.model.prior.relation == "arm"  # one part has moved
-    others = [c.p_value for c in found.conflicts[1:]]
+    assert result.model.prior.relation == "arm"  # one part has moved
+    others = [c.p_value for c in result.conflicts[1:]]
     assert min(others) > 1e-3 / len(others)
     truth = 1.5 * both().world.physics.joint_compliance[2]
-    value = found.parameters["joint_compliance.j3"].value
+    value = result.parameters["joint_compliance.j3"].value
     assert value == pytest.approx(truth, rel=0.15)
-    document = to_json(found)["prior"]
+    document = to_json(result)["prior"]
     assert document["source"]["n_readings"] == len(both().readings)
     assert document["effects"][0]["joint"] == 3
-    _, worst_line, *_, cause = prior_lines(found)  # a moved target looks like the last link
+    _, worst_line, *_, cause = prior_lines(result)  # a moved target looks like the last link
     assert worst_line.startswith("  joint 3's joint compliance is ")
     assert cause.endswith("hilcal compare EARLIER LATER says what has changed.")
 
@@ -286,20 +286,20 @@ def test_the_joint_that_moved_is_found_and_let_go():
 def test_without_a_change_nothing_has_moved():
     clean, prior = noiseless(both().world, plan(15, 78)), carried_prior(learnt(40))
     fits = [with_prior(with_noise(clean, np.random.default_rng(s)), prior) for s in range(4)]
-    p_values = [x.p_value for found in fits for x in found.conflicts]
+    p_values = [x.p_value for result in fits for x in result.conflicts]
     assert min(p_values) > 1e-4
     assert 0.25 < float(np.median(p_values)) < 0.75
 
 
 def test_a_revision_keeps_its_prior():
-    found = repaired()
-    r = found.readings
-    text = to_text(to_record(found, None, None, content_hash(r)))
+    result = repaired()
+    r = result.readings
+    text = to_text(to_record(result, None, None, content_hash(r)))
     again = restore(from_text(text, 1), both().cell, r)
-    np.testing.assert_allclose(again.theta, found.theta, rtol=1e-6, atol=1e-10)
-    np.testing.assert_array_equal(again.model.prior.drift, found.model.prior.drift)
-    assert again.dof == pytest.approx(found.dof, rel=1e-6)
-    np.testing.assert_allclose(again.uncertainty.std, found.uncertainty.std, rtol=1e-4)
+    np.testing.assert_allclose(again.theta, result.theta, rtol=1e-6, atol=1e-10)
+    np.testing.assert_array_equal(again.model.prior.drift, result.model.prior.drift)
+    assert again.dof == pytest.approx(result.dof, rel=1e-6)
+    np.testing.assert_allclose(again.uncertainty.std, result.uncertainty.std, rtol=1e-4)
 
 
 def test_another_arm_of_the_type_may_differ_by_more():
@@ -322,9 +322,9 @@ def test_a_prior_that_is_of_another_arm_is_taken_as_such():
     physics = other.world.physics.with_effect("joint_compliance", softer)
     physics = physics.with_effect("link_geometry", 5e-4 * rng.standard_normal((7, 6)))
     few = measured(replace(other.world, physics=physics), p, rng)
-    found = fit(baseline(other.cell, few, "absolute", prior=carried_prior(known)), few, "absolute")
-    assert (found.model.prior.relation, found.model.prior.by_readings) == ("type", True)
-    assert "The readings say so" in "".join(prior_lines(found))
+    result = fit(baseline(other.cell, few, "absolute", prior=carried_prior(known)), few, "absolute")
+    assert (result.model.prior.relation, result.model.prior.by_readings) == ("type", True)
+    assert "The readings say so" in "".join(prior_lines(result))
 
 
 def test_priors_that_cannot_be_are_refused():

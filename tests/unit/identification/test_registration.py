@@ -69,7 +69,7 @@ def flanges_at(q):
     return np.array([slots_of(CELL.arm, each)[-1] for each in q])
 
 
-def seen(registration, target, m, q=None, noise=0.0, seed=0):
+def rigid_readings(registration, target, m, q=None, noise=0.0, seed=0):
     """Readings of the rigid arm, by products of homogeneous matrices."""
     q = poses() if q is None else q
     there = registration @ flanges_at(q) @ target
@@ -81,7 +81,7 @@ def seen(registration, target, m, q=None, noise=0.0, seed=0):
     return readings_of(q, value, np.full(m, 1e-5))
 
 
-def told(registration, target, registration_known, target_known):
+def cell_with_frames(registration, target, registration_known, target_known):
     """A cell that knows what it is said to know, and something wrong of the rest."""
     return replace(
         CELL,
@@ -95,7 +95,9 @@ def told(registration, target, registration_known, target_known):
 def registered(readings, target=None):
     """Readings from an unknown base, of a target that is unknown unless given."""
     known = target is not None
-    return register(told(np.eye(4), target if known else np.eye(4), False, known), readings)
+    return register(
+        cell_with_frames(np.eye(4), target if known else np.eye(4), False, known), readings
+    )
 
 
 @pytest.mark.parametrize("m", first(1, [6, 3]))
@@ -105,21 +107,21 @@ def test_what_is_unknown_is_found_exactly(
     m, registration_known, target_known, turn, place, tool, offset
 ):
     registration, target = pose_of(turn, place), pose_of(tool, offset)
-    cell = told(registration, target, registration_known, target_known)
+    cell = cell_with_frames(registration, target, registration_known, target_known)
     if m == 3 and not target_known:  # the target's axes cannot be seen in positions
         target = at(*offset)
-    found = register(cell, seen(registration, target, m)).cell
+    registered_cell = register(cell, rigid_readings(registration, target, m)).cell
     # Rounding of readings up to 14 m away, through a few well-conditioned systems; the
     # alternation for positions stops when it moves by less than 1e-12 m.
-    np.testing.assert_allclose(found.registration, registration, rtol=0, atol=2e-9)
-    np.testing.assert_allclose(found.target, target, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(registered_cell.registration, registration, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(registered_cell.target, target, rtol=0, atol=2e-9)
 
 
 @EITHER
 def test_too_few_poses_cannot_answer(m):
     for q in (poses()[:3], np.repeat(poses()[:3], 5, axis=0)):
         with pytest.raises(CannotAnswerError, match="3 distinct poses; measure at least 4"):
-            registered(seen(at(1.0, 0.0, 0.0), np.eye(4), m, q))
+            registered(rigid_readings(at(1.0, 0.0, 0.0), np.eye(4), m, q))
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-5])
@@ -132,7 +134,7 @@ def test_positions_on_a_line_or_in_one_point_cannot_answer(noise):
     tip = np.linalg.inv(flanges_at(point)[0]) @ np.array([0.0, 0.0, 1.0, 1.0])
     for q, target in ((line, at(0.0, 0.0, 0.2)), (point, at(*tip[:3]))):
         with pytest.raises(CannotAnswerError, match="spread in space"):
-            registered(seen(at(1.0, 0.0, 0.0), target, 3, q, noise), target)
+            registered(rigid_readings(at(1.0, 0.0, 0.0), target, 3, q, noise), target)
 
 
 BASE = pose_of(Rotation.from_rotvec([0.4, -0.2, 2.0]).as_matrix(), [0.4, -0.4, 1.9])
@@ -158,15 +160,15 @@ def pointing_down(count, jitter=0.0):
 @EITHER
 @pytest.mark.parametrize("noise", [0.0, 2e-5])
 def test_one_orientation_registers_to_the_noise_and_holds_the_target(m, noise):
-    found = registered(seen(BASE, target_of(m), m, pointing_down(40), noise))
-    assert found.rms < 2 * noise + 1e-9
-    assert len(found.undetermined) == 3
-    np.testing.assert_allclose(found.cell.target[:3, 3], 0, atol=1e-3)
-    assert np.linalg.norm(found.cell.registration[:3, 3] - BASE[:3, 3]) < 0.3
-    for u in found.undetermined:
+    result = registered(rigid_readings(BASE, target_of(m), m, pointing_down(40), noise))
+    assert result.rms < 2 * noise + 1e-9
+    assert len(result.undetermined) == 3
+    np.testing.assert_allclose(result.cell.target[:3, 3], 0, atol=1e-3)
+    assert np.linalg.norm(result.cell.registration[:3, 3] - BASE[:3, 3]) < 0.3
+    for u in result.undetermined:
         shifts = [np.linalg.norm(x) for x in (u.target_shift, u.base_shift)]
         assert shifts[0] == pytest.approx(shifts[1], rel=0.1)
-    words = " ".join(registration_lines(found))
+    words = " ".join(registration_lines(result))
     assert "the target's offset along the flange's z from the height of the base" in words
 
 
@@ -174,43 +176,43 @@ def test_one_orientation_registers_to_the_noise_and_holds_the_target(m, noise):
 def test_one_axis_registers_to_the_noise_at_ordinary_places(m):
     q = np.tile([0.1, -1.3, 1.2, -1.0, -1.2, 0.4], (12, 1))
     q[:, 0] += np.linspace(0, 1.5, 12)
-    found = registered(seen(BASE, target_of(m), m, q, 1e-5))
-    assert found.rms < 3e-5
-    assert found.undetermined
-    assert np.linalg.norm(found.cell.target[:3, 3]) < 1.0
-    assert np.linalg.norm(found.cell.registration[:3, 3]) < 5.0
-    assert "joints 2 to 6 never turned" in " ".join(registration_lines(found))
+    result = registered(rigid_readings(BASE, target_of(m), m, q, 1e-5))
+    assert result.rms < 3e-5
+    assert result.undetermined
+    assert np.linalg.norm(result.cell.target[:3, 3]) < 1.0
+    assert np.linalg.norm(result.cell.registration[:3, 3]) < 5.0
+    assert "joints 2 to 6 never turned" in " ".join(registration_lines(result))
 
 
 def test_positions_count_although_attitudes_of_one_axis_are_blind():
     """Attitudes alone leave the base's turn about the common axis open; positions tell it."""
     q = pointing_down(40)
     q[:, 5] += np.linspace(0, 2, 40)  # turns about the vertical only
-    found = registered(seen(BASE, np.eye(4), 6, q, 1e-5), np.eye(4))
-    assert found.rms < 3e-5
-    np.testing.assert_allclose(found.cell.registration, BASE, atol=2e-4)
+    result = registered(rigid_readings(BASE, np.eye(4), 6, q, 1e-5), np.eye(4))
+    assert result.rms < 3e-5
+    np.testing.assert_allclose(result.cell.registration, BASE, atol=2e-4)
 
 
 @EITHER
 def test_an_undetermined_target_costs_no_accuracy(m):
     """Orientations that scatter by 0.1 mrad do not tell the target's offset but depend on it."""
     target = target_of(m)
-    readings = seen(BASE, target, m, pointing_down(80, 1e-4), 1e-5)
+    readings = rigid_readings(BASE, target, m, pointing_down(80, 1e-4), 1e-5)
     some, other = readings[:40], readings[40:]
     error = []
     for known in (True, False):
-        found = fitted_model(told(BASE, target, False, known), some, "absolute", [])
-        off = found.predict(other.states).position - other.value[:, :3]
+        fitted = fitted_model(cell_with_frames(BASE, target, False, known), some, "absolute", [])
+        off = fitted.predict(other.states).position - other.value[:, :3]
         error.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     assert error[1] < 1.15 * error[0]
 
 
 def test_a_known_frame_is_left_alone():
-    readings = seen(BASE, target_of(3), 3, pointing_down(10), 1e-5)
-    cell = told(BASE, target_of(3), True, True)
-    found = register(cell, readings)
-    assert found.cell is cell
-    assert not found.estimated
+    readings = rigid_readings(BASE, target_of(3), 3, pointing_down(10), 1e-5)
+    cell = cell_with_frames(BASE, target_of(3), True, True)
+    result = register(cell, readings)
+    assert result.cell is cell
+    assert not result.estimated
     assert register(replace(cell, registration=np.eye(4)), readings).rms > 1.0
 
 
@@ -247,7 +249,7 @@ def test_swapped_names_and_a_displaced_reading_are_named(mode, known):
     assert reasons[lone].startswith("target R3: ")
 
 
-PLAIN = told(BASE, np.eye(4), False, False)
+PLAIN = cell_with_frames(BASE, np.eye(4), False, False)
 
 
 def of_arm(change=None, m=3):
@@ -426,8 +428,8 @@ def test_zeros_of_all_joints_that_are_a_little_elsewhere_are_named():
     (explanation,) = finding.explanations
     assert [h.joint for h in explanation.changes] == [2, 3, 4, 5]
     assert explanation.rms < 1e-3
-    found = [h.offset for h in explanation.changes]
-    np.testing.assert_allclose(found, zeros[1:5], rtol=0, atol=2e-3)
+    estimates = [h.offset for h in explanation.changes]
+    np.testing.assert_allclose(estimates, zeros[1:5], rtol=0, atol=2e-3)
     assert "[robot] joint_offset_deg = [0.0, 4.5" in said
 
 
@@ -494,15 +496,15 @@ def cell(name, known=False, **robot):
 
 
 @pytest.mark.parametrize("known", first(1, [False, True]))
-@pytest.mark.parametrize(("true", "told"), [("ur10", "ur10e"), ("ur10e", "ur10")])
-def test_the_other_generation_is_noticed(true, told, known):
+@pytest.mark.parametrize(("true", "configured"), [("ur10", "ur10e"), ("ur10e", "ur10")])
+def test_the_other_generation_is_noticed(true, configured, known):
     """Of 100 such arms, off by 1 mm and mrad, 97 were."""
     named = []
     for seed in range(4):
-        found = other_arm_of(cell(told, known), measured(true, seed, 1.0))
-        named.append(None if found is None else found.name)
-        if found is not None:
-            assert found.rms_with < found.rms / 2
+        suggestion = other_arm_of(cell(configured, known), measured(true, seed, 1.0))
+        named.append(None if suggestion is None else suggestion.name)
+        if suggestion is not None:
+            assert suggestion.rms_with < suggestion.rms / 2
     assert named.count(true) >= 3
     assert set(named) <= {true, None}
 
@@ -570,8 +572,8 @@ def test_the_misfit_of_a_displaced_reflector_follows_the_target():
     share = misfit_breakdown(linearise(fitted_model(cell, c.readings, "absolute")))[0]
     assert share.variable == "target"
     assert share.share > 0.9
-    found = fitted_model(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
-    rows = found.model.slices()[found.model.names.index("target_offset")]
-    theta = found.theta[rows].reshape(3, 3)
+    fitted = fitted_model(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    rows = fitted.model.slices()[fitted.model.names.index("target_offset")]
+    theta = fitted.theta[rows].reshape(3, 3)
     # A common displacement of all targets is hardly told from one of the base; a single one is.
     np.testing.assert_allclose(theta[1] - theta[[0, 2]].mean(axis=0), -by, atol=1.5e-5)

@@ -37,8 +37,8 @@ def campaign(seed, hung=1.0, friction=2.0):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_load_that_is_not_what_it_is_said_to_be(seed):
-    found = check_torques(cell_of(), campaign(seed, hung=0.49))
-    factors = {f.of: f for f in found.factors}
+    check = check_torques(cell_of(), campaign(seed, hung=0.49))
+    factors = {f.of: f for f in check.factors}
     for name, stated in (("5kg", 5.0), ("10kg", 10.0)):
         f = factors[name]
         assert f.differs
@@ -46,36 +46,36 @@ def test_a_load_that_is_not_what_it_is_said_to_be(seed):
         assert f.stated_kg == pytest.approx(stated)
     assert factors["pull x"].stated_kg is None
     assert not factors["the arm's masses"].differs
-    np.testing.assert_array_less(found.std_Nm, 2.0)
+    np.testing.assert_array_less(check.std_Nm, 2.0)
 
 
 @pytest.mark.long
 def test_right_masses_are_not_accused_and_intervals_keep_their_rate():
     inside, accused, count = 0, 0, 0
     for seed in range(25):
-        found = check_torques(cell_of(), campaign(seed))
-        inside += sum(f.low <= 1.0 <= f.high for f in found.factors)
-        accused += sum(f.differs for f in found.factors)
-        count += len(found.factors)
+        check = check_torques(cell_of(), campaign(seed))
+        inside += sum(f.low <= 1.0 <= f.high for f in check.factors)
+        accused += sum(f.differs for f in check.factors)
+        count += len(check.factors)
     assert inside / count > 0.9
     assert accused == 0
 
 
 def test_compliances_by_measured_torques_do_not_need_the_loads():
     """With loads half of what is told, the modelled torques are wrong by 2; the measured right."""
-    told = campaign(3, hung=0.5, friction=0.0)
+    readings = campaign(3, hung=0.5, friction=0.0)
     truth = true_parameters(world_of(cell_of(), np.random.default_rng(3)), "joint_compliance")
-    found = {}
+    ratios = {}
     for name in ("modelled", "measured"):
         cell = replace(cell_of(), measured_torques=name == "measured")
-        fitted = fitted_model(cell, told, "deflection")
-        found[name] = compliances(fitted)[:3] / truth[:3]
+        fitted = fitted_model(cell, readings, "deflection")
+        ratios[name] = compliances(fitted)[:3] / truth[:3]
         if name == "measured":
             off = (compliances(fitted) - truth) / fitted.uncertainty.std[-6:]
             assert np.sqrt(np.mean(off**2)) < 2.0
             assert 0.7 < fitted.variance_factor < 1.4
-    np.testing.assert_allclose(found["modelled"], 0.5, atol=0.03)
-    np.testing.assert_allclose(found["measured"], 1.0, atol=0.02)
+    np.testing.assert_allclose(ratios["modelled"], 0.5, atol=0.03)
+    np.testing.assert_allclose(ratios["measured"], 1.0, atol=0.02)
 
 
 def test_tables_and_files_keep_the_torques(tmp_path):

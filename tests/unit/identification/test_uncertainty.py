@@ -84,13 +84,13 @@ def test_other_scalings_state_the_spread_of_correlated_noise(scaling):
     model, readings, truth = design("deflection")
     model = Model(model.cell, model.effects[2:])
     clean, rng = read(model, readings, truth[9:]), np.random.default_rng(0)
-    found = fit(model, clean, "deflection", scaling)
+    result = fit(model, clean, "deflection", scaling)
     root = np.linalg.cholesky(clean.covariance)
     noise = np.einsum("nij,njd->nid", root, rng.standard_normal((*clean.value.shape, 2000)))
-    s, w = found.solution, found.fitted
+    s, w = result.solution, result.fitted
     estimates = s.transform @ s.equations.inverse() @ (s.rows.T @ w.whiten_readings(noise))
-    seen = found.uncertainty.identifiable
-    ratio = found.uncertainty.formal[seen] / np.std(estimates[seen], axis=1)
+    identifiable = result.uncertainty.identifiable
+    ratio = result.uncertainty.formal[identifiable] / np.std(estimates[identifiable], axis=1)
     assert ratio == pytest.approx(1.0, abs=0.06)
 
 
@@ -155,9 +155,9 @@ def fitted(readings=None, poses=POSES):
     return fitted_model(c.cell, c.readings if readings is None else readings, "absolute")
 
 
-def drawn(found, draws=100, seed=0):
+def drawn(result, draws=100, seed=0):
     with open_engine(1) as engine:
-        return bootstrap(found, engine, draws, seed)
+        return bootstrap(result, engine, draws, seed)
 
 
 def remarks(of):
@@ -188,46 +188,46 @@ def test_the_table_of_long_names_fits_80_columns(monkeypatch):
 @pytest.mark.long
 def test_it_notices_readings_of_a_pose_that_are_not_independent():
     clean = noiseless(campaign("none", "absolute", poses=POSES).world, plan(POSES, 1000))
-    root, found = np.linalg.cholesky(clean.covariance), []
+    root, bootstraps = np.linalg.cholesky(clean.covariance), []
     for seed in range(2):  # noise of the stated size that all readings of a pose have in common
         normal = np.random.default_rng(seed).standard_normal((POSES, clean.m))[clean.pose]
         value = clean.value + np.einsum("nij,nj->ni", root, normal)
-        found.append(drawn(fitted(replace(clean, value=value)), 50))
-    assert not any(b.fit.uncertainty.inflated for b in found)
+        bootstraps.append(drawn(fitted(replace(clean, value=value)), 50))
+    assert not any(b.fit.uncertainty.inflated for b in bootstraps)
     # the formal uncertainty is too small by the root of the readings that a pose has
-    ratio = np.median([b.ratio[:6] for b in found]) / np.sqrt(len(clean) / POSES)
+    ratio = np.median([b.ratio[:6] for b in bootstraps]) / np.sqrt(len(clean) / POSES)
     assert 0.75 < ratio < 1.25
-    assert "Stated too small" in remarks(found[0])
-    crowded = replace(found[0], poses=20)  # for as many parameters
+    assert "Stated too small" in remarks(bootstraps[0])
+    crowded = replace(bootstraps[0], poses=20)  # for as many parameters
     assert "does not show that the stated ones" in remarks(crowded)
     assert "can be used" in remarks(drawn(fitted(), 50))
 
 
 @pytest.mark.long
 def test_the_bits_depend_on_the_seed_and_not_on_the_workers():
-    found, told = fitted(poses=12), list[int]()
-    one = drawn(found, 23)
+    result, progress = fitted(poses=12), list[int]()
+    one = drawn(result, 23)
     with open_engine(2) as engine:
-        two = bootstrap(found, engine, 23, advance=told.append)
-    assert sum(told) == 23
-    assert one.theta.shape == (23, found.model.size)
+        two = bootstrap(result, engine, 23, advance=progress.append)
+    assert sum(progress) == 23
+    assert one.theta.shape == (23, result.model.size)
     np.testing.assert_array_equal(one.theta, two.theta)
     # the first draws are the same however many are asked for
-    np.testing.assert_array_equal(drawn(found, 20).theta, one.theta[:20])
-    assert not np.array_equal(drawn(found, 20, seed=1).theta, one.theta[:20])
+    np.testing.assert_array_equal(drawn(result, 20).theta, one.theta[:20])
+    assert not np.array_equal(drawn(result, 20, seed=1).theta, one.theta[:20])
 
 
 def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading():
     readings = campaign("none", "deflection", poses=12).readings
-    found = resample(readings, distinct_poses(readings), np.random.default_rng(4))
-    size, count = len(readings) // 12, np.bincount(found.pose)
+    sample = resample(readings, distinct_poses(readings), np.random.default_rng(4))
+    size, count = len(readings) // 12, np.bincount(sample.pose)
     assert count.tolist() == [size] * 12
-    assert len(found.pose_names) == 12
-    assert len(set(found.pose_names)) < 12  # some are drawn twice
-    for k, name in enumerate(found.pose_names):
+    assert len(sample.pose_names) == 12
+    assert len(set(sample.pose_names)) < 12  # some are drawn twice
+    for k, name in enumerate(sample.pose_names):
         of = readings.pose == readings.pose_names.index(name)
-        np.testing.assert_array_equal(found.value[found.pose == k], readings.value[of])
-    assert len(whitening(found, "deflection")) == 12 * (size - 1)
+        np.testing.assert_array_equal(sample.value[sample.pose == k], readings.value[of])
+    assert len(whitening(sample, "deflection")) == 12 * (size - 1)
 
 
 def test_two_names_of_one_pose_are_drawn_together():
@@ -239,20 +239,20 @@ def test_two_names_of_one_pose_are_drawn_together():
 
 
 def test_what_it_refuses():
-    found = fitted(poses=12)
-    refusal("draws 5, seed 0; valid: at least 20", drawn, found, 5)
+    result = fitted(poses=12)
+    refusal("draws 5, seed 0; valid: at least 20", drawn, result, 5)
     refusal_of(CannotAnswerError, r"8 distinct poses .* at least 10", drawn, fitted(poses=8))
     with pytest.raises(InputError, match="level 2; valid: between 0 and 1"):
-        drawn(found, 20).interval(2)
+        drawn(result, 20).interval(2)
 
 
 def test_its_document_says_which_parameters_are_compared():
     c = campaign("transmission_error", "absolute", poses=20)
-    found = drawn(fitted_model(c.cell, c.readings, "absolute"), 20)
-    rows = found.to_dict()["parameters"]
+    bootstrapped = drawn(fitted_model(c.cell, c.readings, "absolute"), 20)
+    rows = bootstrapped.to_dict()["parameters"]
     assert [r["name"] for r in rows][:2] == ["base_frame.x", "base_frame.y"]
     for r in rows:
         assert r["interval"][0] <= r["interval"][1]
         assert r["ratio"] in (None, pytest.approx(r["bootstrap_std"] / (r["std"] or 1.0)))
-    assert found.fit.uncertainty.inflated
-    assert "larger than the noise" in remarks(found)
+    assert bootstrapped.fit.uncertainty.inflated
+    assert "larger than the noise" in remarks(bootstrapped)
