@@ -36,7 +36,8 @@ from tests.support.foreign_tables import lines as table_of
 from tests.support.foreign_tables import write
 from tests.support.screen import AtTerminal
 from tests.unit.calibration.other_eyes import by_pinocchio, flanges, urdf_model
-from tests.unit.calibration.test_base import by_ur, pose, seen
+from tests.unit.calibration.test_base import by_ur, pose
+from tests.unit.calibration.test_base import true_positions as seen
 
 pytestmark = pytest.mark.slow
 HIDDEN, SEED, POSES, RUN = "link_geometry", 5, 20, "rehearsal.hilcal"

@@ -40,10 +40,10 @@ def ur_origins(text):
     out = []
     for joint in UR_JOINTS:
         block = text.split(f"  {joint}:\n")[1]
-        found = re.findall(r"^ {4}\w+: (\S+)$", block, re.MULTILINE)[:6]
+        numbers = re.findall(r"^ {4}\w+: (\S+)$", block, re.MULTILINE)[:6]
         # YAML 1.1 takes a number without a point for text, where it has an exponent
-        assert all(re.fullmatch(r"-?\d+(\.\d+(e[-+]\d+)?)?", number) for number in found)
-        six = np.array(found, dtype=float)
+        assert all(re.fullmatch(r"-?\d+(\.\d+(e[-+]\d+)?)?", number) for number in numbers)
+        six = np.array(numbers, dtype=float)
         out.append(se3.matrix(Rotation.from_euler("xyz", six[3:]).as_matrix(), six[:3]))
     return np.stack(out)
 

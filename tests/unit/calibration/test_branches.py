@@ -30,23 +30,23 @@ def pose(q):
     return f"p{joints(np.concatenate([p[0], rotation_vector(r)[0]]))}"
 
 
-def told(*lines, near=None):
-    found = waypoints("\n".join(lines) + "\n")
-    assert not any(w.not_corrected for w in found)
+def branch_doubts(*lines, near=None):
+    program = waypoints("\n".join(lines) + "\n")
+    assert not any(w.not_corrected for w in program)
     none, nowhere = np.full(6, np.nan), np.full((4, 4), np.nan)
     points = Points(
-        tuple(str(w.line) for w in found),
-        np.stack([none if w.q is None else w.q for w in found]),
-        np.stack([nowhere if w.pose is None else w.pose for w in found]),
+        tuple(str(w.line) for w in program),
+        np.stack([none if w.q is None else w.q for w in program]),
+        np.stack([nowhere if w.pose is None else w.pose for w in program]),
     )
     q = on_branch(points, ARM, TOOL, near)
-    return doubts(ARM, TOOL, found, q, near), q
+    return doubts(ARM, TOOL, program, q, near), q
 
 
 def test_waypoints_as_programs_have_them_are_certain():
     b = A + np.array([0.5, 0.1, -0.2, 0.1, 0.1, 0.3])
     c = A - np.array([0.6, -0.2, -0.1, 0.3, 0, 0])
-    why, q = told(
+    why, q = branch_doubts(
         f"movej({joints(A)})",
         f"movel({pose(b)})",
         f"movep({joints(c)})",
@@ -61,20 +61,24 @@ def test_waypoints_as_programs_have_them_are_certain():
 
 
 def test_joint_values_of_another_branch_are_not_where_a_straight_motion_ends():
-    assert told(f"movej({joints(A)})", f"movel({joints(FLIPPED)})", f"movel({pose(A)})")[0] == [
+    assert branch_doubts(f"movej({joints(A)})", f"movel({joints(FLIPPED)})", f"movel({pose(A)})")[
+        0
+    ] == [
         "",
         NOT_STRAIGHT,
         UNKNOWN,
     ]
-    assert told(f"movel({joints(FLIPPED)})")[0] == [""]  # as they are, where nothing is known
-    assert told(f"movej({joints(A)})", f"movej({joints(FLIPPED)})")[0] == ["", ""]
+    assert branch_doubts(f"movel({joints(FLIPPED)})")[0] == [
+        ""
+    ]  # as they are, where nothing is known
+    assert branch_doubts(f"movej({joints(A)})", f"movej({joints(FLIPPED)})")[0] == ["", ""]
 
 
 def test_near_to_two_branches_is_uncertain():
     between = 0.5 * (A + FLIPPED)
     line = f"movej(get_inverse_kin({pose(A)}, qnear={joints(between)}))"
-    assert told(line)[0] == [NEAREST]
-    assert told(f"movel({pose(A)})", near=A + 0.1)[0] == [""]
+    assert branch_doubts(line)[0] == [NEAREST]
+    assert branch_doubts(f"movel({pose(A)})", near=A + 0.1)[0] == [""]
 
 
 @pytest.mark.long
@@ -85,12 +89,12 @@ def test_what_is_certain_is_the_nearest_of_all_solutions():
     for k in (0, 1, 35, 57):
         near = A + cases[k, 0]
         goal = near + cases[k, 1]
-        (why,), q = told(f"movej(get_inverse_kin({pose(goal)}, qnear={joints(near)}))")
+        (why,), q = branch_doubts(f"movej(get_inverse_kin({pose(goal)}, qnear={joints(near)}))")
         r, p, _ = poses(goal[None])
         every = invert(
             ARM, lambda at, _: poses(at), starts, np.repeat(r, 60, 0), np.repeat(p, 60, 0)
         )
         turns = (every.q[every.solved] - near + np.pi) % (2 * np.pi) - np.pi
-        mine = np.linalg.norm((q[0] - near + np.pi) % (2 * np.pi) - np.pi)
-        assert mine <= np.linalg.norm(turns, axis=1).min() + 1e-6
+        distance = np.linalg.norm((q[0] - near + np.pi) % (2 * np.pi) - np.pi)
+        assert distance <= np.linalg.norm(turns, axis=1).min() + 1e-6
         assert why == ""

@@ -80,9 +80,9 @@ def test_the_base_does_not_move_along_with_the_first_link(effect):
     """Moving the base along with the first link changes no reading, and no correction either."""
     c, r = calibrated(effect), campaign(effect, "absolute", 0, poses=POSES).readings
     base = c.base_in_tracker()
-    seen = (r.value[:, :3] - base[:3, 3]) @ base[:3, :3]
+    positions = (r.value[:, :3] - base[:3, 3]) @ base[:3, :3]
     p = c.predict(r.states.q, r.states.wrench)
-    np.testing.assert_allclose(p.position, seen, atol=2e-4)
+    np.testing.assert_allclose(p.position, positions, atol=2e-4)
     shifted = replace(c, theta=c.theta + moved_along(c))
     again = shifted.predict(r.states.q, r.states.wrench)
     np.testing.assert_allclose(again.position, p.position, atol=5e-6)  # loads pull elsewhere
@@ -223,9 +223,9 @@ def test_points_outside_of_what_was_measured_are_named():
     q[1, 2] = ranges["joint 3 angle"].high + 0.5
     heavy = np.array([0.0, 0.0, -3 * ranges["force"].high, 0.0, 0.0, 0.0])
     p = c.predict(q, np.stack([heavy, 0 * heavy]))
-    found = {o.range.variable: o.points.tolist() for o in p.outside}
-    assert found["joint 3 angle"] == [False, True]
-    assert found["force"] == [True, False]
+    outside = {o.range.variable: o.points.tolist() for o in p.outside}
+    assert outside["joint 3 angle"] == [False, True]
+    assert outside["force"] == [True, False]
 
 
 def test_a_correction_that_bends_the_elbow_the_other_way_is_refused():
@@ -247,8 +247,8 @@ def test_a_correction_that_turns_a_joint_far_is_told():
     q, names = states.q[:20].copy(), ["point"] * 20
     assert far_turned(names, q, c.compensate(q, states.wrench[:20])) == ""
     q[:, 4] = 2e-3  # the wrist is nearly straight
-    told = far_turned(names, q, c.compensate(q, states.wrench[:20]))
-    assert re.match(r"the correction of point turns joint [46] by \d+\.\d°", told)
+    warning = far_turned(names, q, c.compensate(q, states.wrench[:20]))
+    assert re.match(r"the correction of point turns joint [46] by \d+\.\d°", warning)
 
 
 def test_wrong_input_is_refused_in_words():
@@ -268,8 +268,8 @@ def test_wrong_input_is_refused_in_words():
 def test_the_band_of_what_hardly_scatters_is_a_number(size):
     """Nothing left beside a scatter that is not known: a band of 0, not one that is no number."""
     c = np.diag([1.0, 2.0, 3.0])
-    (found,) = band(size * c[None])
-    assert found == pytest.approx(np.sqrt(size) * band(c[None])[0], rel=1e-2)
+    (width,) = band(size * c[None])
+    assert width == pytest.approx(np.sqrt(size) * band(c[None])[0], rel=1e-2)
     assert band(np.stack([size * c, c]))[1] == band(c[None])[0]
 
 

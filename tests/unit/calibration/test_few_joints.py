@@ -51,17 +51,17 @@ def test_the_position_is_met_and_the_orientation_as_near_as_it_can_be(name, tmp_
     def found_from(start):
         return invert(arm, lambda at, _: nominal_pose(true, TOOL, at), start, rotation, position)
 
-    found = found_from(q)
-    assert found.solved.all()
-    turned, reached, _ = nominal_pose(true, TOOL, found.q)
+    solution = found_from(q)
+    assert solution.solved.all()
+    turned, reached, _ = nominal_pose(true, TOOL, solution.q)
     np.testing.assert_allclose(reached, position, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.q, arm.complete(found.q), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(solution.q, arm.complete(solution.q), rtol=0, atol=1e-15)
     angle = np.linalg.norm(se3.rotation_vector(turned @ np.swapaxes(rotation, 1, 2)), axis=1)
-    np.testing.assert_allclose(angle, found.residual_rad, atol=1e-9)
+    np.testing.assert_allclose(angle, solution.residual_rad, atol=1e-9)
     assert 1e-4 < angle.max() < MOST_TURNED
     # The best there is: one, wherever the search begins.
     again = found_from(arm.complete(q + 0.02 * rng.uniform(-1, 1, q.shape)))
-    np.testing.assert_allclose(again.q, found.q, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(again.q, solution.q, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -70,9 +70,9 @@ def test_an_orientation_that_the_arm_cannot_have_is_not_solved(name, tmp_path):
     q = np.array(ARMS[name][1])[None]
     rotation, position, _ = nominal_pose(arm, TOOL, q)
     across = rotation @ se3.rotation(np.array([[0.1, 0.1, 0.1]]))
-    found = invert(arm, lambda at, _: nominal_pose(arm, TOOL, at), q, across, position)
-    assert found.residual_m < 1e-9
-    assert not found.solved.any()
+    solution = invert(arm, lambda at, _: nominal_pose(arm, TOOL, at), q, across, position)
+    assert solution.residual_m < 1e-9
+    assert not solution.solved.any()
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])

@@ -18,28 +18,28 @@ from tests.unit.calibration.test_calibration import calibrated, fresh
 @pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
 def test_constant_effects_are_in_the_transforms_exactly(effect):
     c = calibrated(effect)
-    found = corrected_arm(c)
-    assert found.included == (effect,)
-    assert found.not_included == ("joint_compliance",)
+    corrected = corrected_arm(c)
+    assert corrected.included == (effect,)
+    assert corrected.not_included == ("joint_compliance",)
     states = fresh()
     situation = c.model.predict(states, c.theta).situation
     deviation = Deviation()
-    for e, mine in zip(c.model.effects, c.model.slices(), strict=True):
+    for e, rows in zip(c.model.effects, c.model.slices(), strict=True):
         if e.name == effect:
-            deviation = e.deviation(c.theta[mine], situation)
+            deviation = e.deviation(c.theta[rows], situation)
     base, behind = c.frames.chain, c.frames.flange
     expected = base @ flanges(c.model.cell.arm, states.q, deviation) @ behind
-    np.testing.assert_allclose(flanges(found.arm, states.q), expected, atol=1e-12)
+    np.testing.assert_allclose(flanges(corrected.arm, states.q), expected, atol=1e-12)
     assert np.abs(expected - flanges(c.model.cell.arm, states.q)).max() > 1e-5
 
 
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
 def test_what_is_not_constant_is_named_and_left_out(effect):
     c = calibrated(effect)
-    found = corrected_arm(c)
-    assert effect in found.not_included
-    assert found.included == ()
-    np.testing.assert_allclose(found.arm.links, c.model.cell.arm.links, atol=1e-12)
+    corrected = corrected_arm(c)
+    assert effect in corrected.not_included
+    assert corrected.included == ()
+    np.testing.assert_allclose(corrected.arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])

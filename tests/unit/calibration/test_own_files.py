@@ -46,8 +46,8 @@ def correct(path, nominal, new, *ends):
 
 
 def lines_changed(before, after):
-    found = difflib.unified_diff(before.split("\n"), after.split("\n"), n=0, lineterm="")
-    return [line[1:] for line in found if line.startswith("+") and not line.startswith("+++")]
+    diff = difflib.unified_diff(before.split("\n"), after.split("\n"), n=0, lineterm="")
+    return [line[1:] for line in diff if line.startswith("+") and not line.startswith("+++")]
 
 
 def test_a_urdf_keeps_all_but_the_origins_of_its_joints(arm, tmp_path):
@@ -61,15 +61,15 @@ def test_a_urdf_keeps_all_but_the_origins_of_its_joints(arm, tmp_path):
     text = text.replace('<origin xyz="0 0 0" rpy="0 0 0"/>', "")  # joint 6
     path, new = tmp_path / "mine.urdf", changed(arm)
     path.write_bytes(text.encode())
-    found = correct(path, arm, new)
-    after = found.content.decode()
-    path.write_bytes(found.content)
+    corrected = correct(path, arm, new)
+    after = corrected.content.decode()
+    path.write_bytes(corrected.content)
     made = by_pinocchio(pin.buildModelFromUrdf(str(path)), Q, "tool0", "base_link")
     np.testing.assert_allclose(made, poses(new), atol=NM)
     assert len(lines_changed(text, after)) == 7
     joint_origin = re.compile(r"(<joint[^>]*>)(<origin[^>]*/>)?")
     assert joint_origin.sub(r"\1", after) == joint_origin.sub(r"\1", text)
-    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in found.note
+    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in corrected.note
     same = correct(tmp_path / "krl.urdf", arm, arm)
     assert same.content == (tmp_path / "krl.urdf").read_bytes()
     assert "krl.urdf: no place changed, all else" in same.note
@@ -103,10 +103,10 @@ def test_a_xacro_is_corrected_where_it_has_numbers(arm, tmp_path):
     text = text.replace("</robot>", "</xacro:macro></robot>")
     path = tmp_path / "krl.xacro"
     path.write_text(text)
-    found = correct(path, arm, changed(arm, slice(1, 5)), "base_link", "tool0")
-    assert "places changed (${prefix}j2, ${prefix}j3, ${prefix}j4, ${prefix}j5)" in found.note
-    assert len(lines_changed(text, found.content.decode())) == 4
-    assert found.content.decode().count("${pi/2}") == 1
+    corrected = correct(path, arm, changed(arm, slice(1, 5)), "base_link", "tool0")
+    assert "places changed (${prefix}j2, ${prefix}j3, ${prefix}j4, ${prefix}j5)" in corrected.note
+    assert len(lines_changed(text, corrected.content.decode())) == 4
+    assert corrected.content.decode().count("${pi/2}") == 1
     with pytest.raises(InputError, match=r"krl\.xacro: line 16: the place of joint 'flange' is"):
         correct(path, arm, changed(arm), "base_link", "tool0")
     path.write_text(text.replace("0 0 0.45", "0 0 ${h1}"))
@@ -118,23 +118,23 @@ def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm, tmp_path):
     path, new = tmp_path / "lab.xml", changed(arm)
     path.write_text(MJCF)
 
-    def seen():
+    def flanges_of_file():
         return by_pinocchio(pin.buildModelFromMJCF(str(path)), Q, "flange", "base")
 
-    np.testing.assert_allclose(seen(), poses(arm), atol=NM)
-    found = correct(path, arm, new, "base", "flange")
-    path.write_bytes(found.content)
-    np.testing.assert_allclose(seen(), poses(new), atol=NM)
-    after = found.content.decode()
+    np.testing.assert_allclose(flanges_of_file(), poses(arm), atol=NM)
+    corrected = correct(path, arm, new, "base", "flange")
+    path.write_bytes(corrected.content)
+    np.testing.assert_allclose(flanges_of_file(), poses(new), atol=NM)
+    after = corrected.content.decode()
     assert len(lines_changed(MJCF, after)) == 7
     assert "<!-- the arm of bay 3 -->" in after
-    assert "1 places have" not in found.note
+    assert "1 places have" not in corrected.note
     rounded = MJCF.replace("0.61 0.1 0", "0.612 0.1 0").replace("0 0 0.66", "0 0 0.663")
     path.write_text(rounded)
-    found = correct(path, arm, new, "base", "flange")
-    assert "its axes were up to 3.00 mm from those of the nominal krl" in found.note
-    path.write_bytes(found.content)
-    np.testing.assert_allclose(seen(), poses(new), atol=NM)
+    corrected = correct(path, arm, new, "base", "flange")
+    assert "its axes were up to 3.00 mm from those of the nominal krl" in corrected.note
+    path.write_bytes(corrected.content)
+    np.testing.assert_allclose(flanges_of_file(), poses(new), atol=NM)
     lost = correct(path, new, changed(new), "base")
     assert "cannot represent the shift of the flange" in lost.note
 
@@ -176,8 +176,8 @@ def test_an_sdf_is_the_corrected_arm_and_carries_what_hangs_on_it(arm, tmp_path)
     path, new = tmp_path / "lab.sdf", changed(arm)
     path.write_text(SDF)
     np.testing.assert_allclose(sdf_flanges(SDF), poses(arm), atol=NM)
-    found = correct(path, arm, new, "base", "tool0")
-    after = found.content.decode()
+    corrected = correct(path, arm, new, "base", "tool0")
+    after = corrected.content.decode()
     np.testing.assert_allclose(sdf_flanges(after), poses(new), atol=1e-8)
     assert "<!-- by hand -->" in after
     places = re.compile(r"(<pose[^>]*>|<xyz[^>]*>)[^<]*")
@@ -200,9 +200,9 @@ def test_ur_s_calibration_conf_makes_the_controller_s_rows_the_arm(tmp_path):
     )
     path = tmp_path / "calibration.conf"
     path.write_bytes(text.encode())
-    found = correct(path, nominal, new)
-    assert "tcp_for_ur_kinematics" in found.note
-    after = found.content.decode()
+    corrected = correct(path, nominal, new)
+    assert "tcp_for_ur_kinematics" in corrected.note
+    after = corrected.content.decode()
     assert len(lines_changed(text, after)) == 4
     deltas = {
         key: np.array([float(v) for v in values.split(",")])

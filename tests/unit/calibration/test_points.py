@@ -109,13 +109,13 @@ def other_names(header):
 
 def test_other_names_are_taken_where_nothing_is_unsure(tmp_path):
     joints = ",".join(f"J{k} [deg]" for k in range(1, 7))
-    told = other_names(f"{joints},X [mm],Y [mm],Z [mm]")
-    found = read_points(written(tmp_path, told), ARM, LOADS)
-    np.testing.assert_allclose(found.q, Q[:2], atol=1e-9)
-    np.testing.assert_allclose(found.target_poses[:, :3, 3], poses(Q[:2])[:, :3, 3], atol=1e-9)
-    assert found.wrench[0, 2] == -98.0665
+    text = other_names(f"{joints},X [mm],Y [mm],Z [mm]")
+    points = read_points(written(tmp_path, text), ARM, LOADS)
+    np.testing.assert_allclose(points.q, Q[:2], atol=1e-9)
+    np.testing.assert_allclose(points.target_poses[:, :3, 3], poses(Q[:2])[:, :3, 3], atol=1e-9)
+    assert points.wrench[0, 2] == -98.0665
     for part in ("joints = J1 [deg], J2 [deg]", "position = X [mm], Y [mm]", "load = Load"):
-        assert part in found.guess
+        assert part in points.guess
     vague = other_names(",".join("abcdefghi"))
     with pytest.raises(InputError, match=r"cannot be guessed: .*hilcal import .* --preview -o"):
         read_points(written(tmp_path, vague), ARM, LOADS)
@@ -133,17 +133,17 @@ def test_a_unit_is_taken_where_the_arm_tells_it(tmp_path, far):
     if far:
         refusal("position: no unit stated", read_points, path, ARM, LOADS)
         return
-    found = read_points(path, ARM, LOADS)
-    np.testing.assert_allclose(found.target_poses[:, :3, 3], points[:, :3, 3], atol=1e-9)
+    result = read_points(path, ARM, LOADS)
+    np.testing.assert_allclose(result.target_poses[:, :3, 3], points[:, :3, 3], atol=1e-9)
 
 
 def test_joint_values_alone_under_other_names(tmp_path):
     rows = "".join(";".join(f"{v:.9f}" for v in np.degrees(q)) + "\n" for q in Q)
     path = written(tmp_path, "A1;A2;A3;A4;A5;A6\n" + rows.replace(".", ","))
-    found = read_points(path, ARM, LOADS)
-    np.testing.assert_allclose(found.q, Q, atol=1e-9)
-    assert found.target_poses is None
-    assert found.wrench is None
+    points = read_points(path, ARM, LOADS)
+    np.testing.assert_allclose(points.q, Q, atol=1e-9)
+    assert points.target_poses is None
+    assert points.wrench is None
 
 
 @pytest.mark.parametrize("kind", ["csv", "xlsx", "parquet"])
@@ -160,11 +160,13 @@ def test_poses_without_joint_values_by_a_mapping(tmp_path, kind):
     proposed = propose(path).proposal.to_toml(path.name)
     convention = re.compile('convention = ".*"')
     assert convention.search(proposed)
-    told = written(tmp_path, convention.sub('convention = "rotation-vector"', proposed), "m.toml")
-    found = read_points(path, ARM, LOADS, find_mapping(told, PointMapping))
-    np.testing.assert_allclose(on_branch(found, ARM, TOOL, Q[0] + 0.1), Q, atol=1e-8)
+    mapping = written(
+        tmp_path, convention.sub('convention = "rotation-vector"', proposed), "m.toml"
+    )
+    points = read_points(path, ARM, LOADS, find_mapping(mapping, PointMapping))
+    np.testing.assert_allclose(on_branch(points, ARM, TOOL, Q[0] + 0.1), Q, atol=1e-8)
     with pytest.raises(InputError, match="joints"):  # which readings need
-        find_mapping(told, Mapping)
+        find_mapping(mapping, Mapping)
 
 
 def test_a_pose_out_of_reach_is_named(tmp_path):

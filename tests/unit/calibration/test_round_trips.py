@@ -219,10 +219,12 @@ def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same():
         c.model,
         effects=(*c.model.effects, Sagging(c.model.cell, state_with_every_column(c.model.cell))),
     )
-    mine = replace(c, model=model, theta=np.append(c.theta, 2e-3), root=np.zeros((model.size, 1)))
+    with_sagging = replace(
+        c, model=model, theta=np.append(c.theta, 2e-3), root=np.zeros((model.size, 1))
+    )
     assert c.without_kernel() == ()
-    assert mine.without_kernel() == ("sagging",)
+    assert with_sagging.without_kernel() == ("sagging",)
     q = regular(c, joints(5))
-    k = mine.compensate(q, std=False)
+    k = with_sagging.compensate(q, std=False)
     wanted = evaluate(c.model.cell.arm, q).point(c.tool_pose()[:3, 3])
-    np.testing.assert_allclose(mine.predict(k.q, std=False).position, wanted, atol=NM)
+    np.testing.assert_allclose(with_sagging.predict(k.q, std=False).position, wanted, atol=NM)

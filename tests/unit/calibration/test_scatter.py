@@ -45,17 +45,17 @@ def once(readings):
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_repeats_show_the_scatter(mode):
     c = campaign(poses=16, cycles=3)
-    found = Calibration.of(fitted(c, mode, instrument(c)))
-    assert found.scatter.source == "repeats"
-    np.testing.assert_allclose(found.scatter.joint_std, TRUE, rtol=0.25)
+    calibration = Calibration.of(fitted(c, mode, instrument(c)))
+    assert calibration.scatter.source == "repeats"
+    np.testing.assert_allclose(calibration.scatter.joint_std, TRUE, rtol=0.25)
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 @pytest.mark.parametrize(("rp", "source"), [(5e-5, "maker"), (None, "industry")])
 def test_without_repeats_it_is_the_makers(mode, rp, source):
     c = campaign(poses=16)
-    found = fitted(c, mode, once(instrument(c)), rp)
-    b = budget(found)
+    result = fitted(c, mode, once(instrument(c)), rp)
+    b = budget(result)
     assert b.scatter_source == source
     arrivals = 2 if mode == "deflection" else 1
     np.testing.assert_allclose(b.scatter, np.sqrt(arrivals) * (rp or 1e-4) / RP_PER_RMS)
@@ -75,17 +75,17 @@ def test_of_distances_the_scatter_is_that_along_their_line():
 def test_the_budget_is_never_below_what_poses_left_out_show(mode, poses):
     """An effect that the model lacks, and few poses: fitted ones are nearer than new ones are."""
     c = campaign("joint_tilt_compliance", mode, poses=poses, strength=8.0)
-    found = fitted(c, mode, c.readings)
-    assert budget(found).combined >= found.holdout.rms_m * (1 - 1e-9)
-    assert found.holdout.rms_m > found.error.rms_m
+    result = fitted(c, mode, c.readings)
+    assert budget(result).combined >= result.holdout.rms_m * (1 - 1e-9)
+    assert result.holdout.rms_m > result.error.rms_m
 
 
 def test_the_instrument_is_as_stated_beside_a_scatter_in_units_of_its_noise():
     c = campaign(poses=16)
     alone = instrument(c)
     scatter = ArmScatter("joints", (TRUE,), (1e-6,), 2e-5, 0.0, 0.3, unit=0.3)
-    found = fitted(c, "absolute", with_arm_scatter(c.cell, alone, scatter))
-    b = budget(found)
+    result = fitted(c, "absolute", with_arm_scatter(c.cell, alone, scatter))
+    b = budget(result)
     assert b.instrument == pytest.approx(noise_floor(alone.covariance), rel=0.02)
 
 
@@ -99,8 +99,8 @@ def test_identical_rows_are_no_repeats():
 
 def test_repeats_below_the_noise_say_how_much_it_can_be():
     c = campaign(poses=16, cycles=3)
-    own = instrument(c)
-    noisy = replace(own, covariance=100.0 * own.covariance)
+    alone = instrument(c)
+    noisy = replace(alone, covariance=100.0 * alone.covariance)
     scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
     assert scatter.source == "repeats"
     assert TRUE < scatter.joint_std[0] < 10 * TRUE
@@ -108,5 +108,5 @@ def test_repeats_below_the_noise_say_how_much_it_can_be():
 
 def test_what_the_fit_or_the_cell_states_goes_first():
     c = campaign(poses=16, cycles=3)
-    found = fitted_model(c.cell, c.readings, "absolute")
-    assert Calibration.of(found).scatter.source == "stated"
+    result = fitted_model(c.cell, c.readings, "absolute")
+    assert Calibration.of(result).scatter.source == "stated"

@@ -29,11 +29,11 @@ SETUP = "set_tcp(p[0,0,0.1,0,0,0])\n"
 def corrected(program):
     """The program with other joint values, these by line, and why lines are left."""
     every = waypoints(program)
-    found = [w for w in every if not w.not_corrected]
-    q = np.arange(6.0 * len(found)).reshape(-1, 6) + 100.0
-    new = dict(zip((w.line for w in found), q, strict=True))
+    understood = [w for w in every if not w.not_corrected]
+    q = np.arange(6.0 * len(understood)).reshape(-1, 6) + 100.0
+    new = dict(zip((w.line for w in understood), q, strict=True))
     return (
-        with_joints(program, found, q),
+        with_joints(program, understood, q),
         new,
         {w.line: w.not_corrected for w in every if w.not_corrected},
     )
@@ -52,7 +52,7 @@ def check_understood(program, seeds=4):
     again, new, left = corrected(program)
     every = {w.line: w for w in waypoints(program)}
     order = [w.line for w in every.values() if not w.not_corrected]
-    seen = 0
+    count = 0
     for seed in range(seeds):
         for shared in (False, True):
             before = Machine(seed, shared).run(program)
@@ -65,7 +65,7 @@ def check_understood(program, seeds=4):
                 if w.not_corrected:
                     assert now.target == old.target
                 else:
-                    seen += 1
+                    count += 1
                     np.testing.assert_allclose(now.target, new[w.line])
                     pose, near = old.target, None
                     if isinstance(pose, tuple):
@@ -89,7 +89,7 @@ def check_understood(program, seeds=4):
                     else:
                         np.testing.assert_allclose(w.tool, as_pose(old.tool))
                 at, servoed = old.line, old.kind == "servoj"
-    return seen
+    return count
 
 
 POLYSCOPE = f"""def Program():
@@ -148,8 +148,8 @@ def test_a_waypoint_that_is_not_understood_is_refused_by_line_or_left(case, give
     path = tmp_path / "p.script"
     path.write_text(given)
     said = refuses(case, lambda: program_points(path), path)
-    found = re.search(r"line (\d+): (?:the waypoint .*\((.*)\); valid|)", said)
-    line, why = int(found[1]), found[2] or ""
+    match = re.search(r"line (\d+): (?:the waypoint .*\((.*)\); valid|)", said)
+    line, why = int(match[1]), match[2] or ""
     assert why in corrected(given)[2][line]
     if "x)" not in given:
         check_understood(given)
@@ -203,8 +203,8 @@ def test_values_that_double_and_chains_of_variables_take_no_time():
     ],
 )
 def test_a_corrected_program_is_not_corrected_again(program, marked, tmp_path):
-    path, found = tmp_path / "p.script", waypoints(program)
-    again = with_joints(program, found, np.zeros((1, 6)))
+    path, points = tmp_path / "p.script", waypoints(program)
+    again = with_joints(program, points, np.zeros((1, 6)))
     lines = again.splitlines()
     assert [line for line in lines if line.endswith("  # corrected by hilcal")] == [
         line for line in lines if line.startswith(marked)
@@ -335,15 +335,15 @@ class Writer:
 
 def met(seeds):
     """How many programs have motions that were seen corrected, waypoints left, or are refused."""
-    seen = left = refused = 0
+    understood = left = refused = 0
     for seed in seeds:
         program = Writer(seed).program()
         try:
-            seen += check_understood(program, seeds=1) > 0
+            understood += check_understood(program, seeds=1) > 0
             left += bool(corrected(program)[2])
         except InputError:
             refused += 1
-    return [seen, left, refused]
+    return [understood, left, refused]
 
 
 @pytest.mark.long

@@ -185,9 +185,9 @@ def test_points_are_where_pinocchio_has_them(maker, examples):
 @pytest.mark.parametrize("maker", EXAMPLE)
 def test_without_a_correction_every_byte_stays(maker, ends, arms, tmp_path):
     copied(maker, tmp_path, lambda text: text.replace("\r\n", ends))
-    found = read(maker, arms, tmp_path)
-    noise = 1e-11 * np.random.default_rng(0).standard_normal(found.q.shape)
-    for suffix, content in found.corrected(found.q + noise).items():
+    resolved = read(maker, arms, tmp_path)
+    noise = 1e-11 * np.random.default_rng(0).standard_normal(resolved.q.shape)
+    for suffix, content in resolved.corrected(resolved.q + noise).items():
         assert content == (tmp_path / f"weld{suffix}").read_bytes()
 
 
@@ -198,18 +198,18 @@ def test_a_program_that_begins_with_a_byte_order_mark_is_not_corrected_twice(
     copied(maker, tmp_path, lambda t: t[max(t.find(head), 0) :].replace("PROC", "TRAP"))
     path = tmp_path / EXAMPLE[maker].file
     path.write_text(f"\ufeff{path.read_text('latin-1')}", encoding="utf-8", newline="")
-    found = read(maker, arms, tmp_path)
-    path.write_bytes(found.corrected(found.q + DELTA)[path.suffix])
+    resolved = read(maker, arms, tmp_path)
+    path.write_bytes(resolved.corrected(resolved.q + DELTA)[path.suffix])
     refusal(r"line 1: it is corrected already", read, maker, arms, tmp_path)
 
 
 @pytest.mark.parametrize("maker", EXAMPLE)
 def test_a_corrected_program_means_the_corrected_joint_values(maker, arms, examples, tmp_path):
     """By its own reading, and one pose by other eyes: a pattern, SciPy and Pinocchio."""
-    e, found = EXAMPLE[maker], examples[maker]
-    wanted = found.q + DELTA
+    e, resolved = EXAMPLE[maker], examples[maker]
+    wanted = resolved.q + DELTA
     numbers = re.compile(r"(?<![A-Za-z\d])[-+]?\s*(\d+\.?\d*|\.\d+)(E\+?\d+)?")
-    for suffix, content in found.corrected(wanted).items():
+    for suffix, content in resolved.corrected(wanted).items():
         (tmp_path / f"weld{suffix}").write_bytes(content)
         old = (EXAMPLES / f"weld{suffix}").read_bytes().decode("latin-1").split("\r\n")
         text = content.decode("latin-1")
@@ -263,17 +263,17 @@ def test_flags_tell_every_branch_and_turn(maker, arms):
         ProgramPoint(k, f"{k}", values=language.numbers(pose, near), flags=tuple(flags.tolist()))
         for k, (pose, flags) in enumerate(zip(poses, flags_of(arm, language, q), strict=True))
     )
-    found, doubts, said = resolve(Program(language, (), (), points), arm, None)
+    joint_values, doubts, said = resolve(Program(language, (), (), points), arm, None)
     assert not any(doubts)
     assert not said
-    np.testing.assert_allclose(found, q, atol=1e-6)
+    np.testing.assert_allclose(joint_values, q, atol=1e-6)
 
 
 def test_a_joint_that_passes_zero_changes_its_turn(examples):
-    found = examples["krl"]
-    q = found.q.copy()
+    krl = examples["krl"]
+    q = krl.q.copy()
     q[0, 3], q[2, 0] = -0.01, -0.02  # joint 4 of XP1, joint 1 of XP3
-    dat = found.corrected(q)[".dat"].decode("latin-1")
+    dat = krl.corrected(q)[".dat"].decode("latin-1")
     assert re.search(r"XP1=.*,S 2,T 26,E1", dat)  # 18 + 8
     assert re.search(r"XP3=.*,S 'B010',T 11\}", dat)  # 10 + 1
     rapid = examples["rapid"]
@@ -310,11 +310,11 @@ def test_what_is_left_and_all_that_it_counts_from_stay_as_they_are(
     maker, old, new, left, arms, tmp_path
 ):
     copied(maker, tmp_path, lambda text: text.replace(old, new))
-    found = read(maker, arms, tmp_path, leave=True)
-    assert [p.name for p in found.program.points if p.not_corrected] == left
-    for suffix, content in found.corrected(found.q + DELTA).items():
+    resolved = read(maker, arms, tmp_path, leave=True)
+    assert [p.name for p in resolved.program.points if p.not_corrected] == left
+    for suffix, content in resolved.corrected(resolved.q + DELTA).items():
         before = (tmp_path / f"weld{suffix}").read_bytes().split(b"\r\n")
-        for p in found.program.points:
+        for p in resolved.program.points:
             if p.not_corrected and (p.name.startswith("line") != (suffix == ".dat")):
                 assert content.split(b"\r\n")[p.line - 1] == before[p.line - 1]
 
@@ -325,8 +325,8 @@ def test_tool_and_base_of_a_spline_block_hold_within_it_alone(arms, tmp_path):
     def weld(statements):
         lines = "\r\n".join(statements)
         copied("krl", tmp_path, lambda t: t.replace("LIN XP2 C_DIS C_DIS", lines))
-        found = read("krl", arms, tmp_path, leave=True).program.points
-        return next(p for p in found if p.name.startswith("XP2"))
+        points = read("krl", arms, tmp_path, leave=True).program.points
+        return next(p for p in points if p.name.startswith("XP2"))
 
     for word in ("SPLINE", "PTP_SPLINE"):
         block = [f"{word} WITH $BASE = $NULLFRAME", "SPL XP2", "ENDSPLINE"]
@@ -372,9 +372,11 @@ def test_points_of_a_frame_that_the_program_changes_are_left(
     statement, changed, left, arms, tmp_path
 ):
     copied("krl", tmp_path, lambda t: t.replace("PTP XP1", f"PTP XP1\r\n{statement}"))
-    found = [p for p in read("krl", arms, tmp_path, leave=True).program.points if p.not_corrected]
-    assert [p.name.partition(" (")[0] for p in found] == left
-    assert all(p.not_corrected.endswith(f"changes {changed}") for p in found)
+    uncorrected = [
+        p for p in read("krl", arms, tmp_path, leave=True).program.points if p.not_corrected
+    ]
+    assert [p.name.partition(" (")[0] for p in uncorrected] == left
+    assert all(p.not_corrected.endswith(f"changes {changed}") for p in uncorrected)
 
 
 def test_a_base_that_the_program_sets_after_its_use_is_unknown(arms, tmp_path):
@@ -428,9 +430,9 @@ def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path)
         )
     )
     program = Program(KRL, (), (), points)
-    found, doubts, said = resolve(program, arm, q[0] + 0.05)
+    joint_values, doubts, said = resolve(program, arm, q[0] + 0.05)
     assert not any(doubts)
-    np.testing.assert_allclose(found, q, atol=1e-8)
+    np.testing.assert_allclose(joint_values, q, atol=1e-8)
     assert (
         "2 points state a shape of the arm, which is defined only for KRL arms of the usual form"
         in said[0]
@@ -443,10 +445,10 @@ def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path)
 def test_angles_are_those_that_were_there_at_every_pitch(language, b):
     given = np.array([100.0, 200.0, 300.0, 170.0, b, -175.0])
     pose = language.pose(given)
-    found = language.numbers(pose, given)
-    np.testing.assert_allclose(language.pose(found), pose, atol=1e-12)
+    numbers = language.numbers(pose, given)
+    np.testing.assert_allclose(language.pose(numbers), pose, atol=1e-12)
     if b == 0.0:
-        np.testing.assert_allclose(found, given, atol=1e-9)
+        np.testing.assert_allclose(numbers, given, atol=1e-9)
     turned = pose @ se3.matrix(se3.rotation(np.array([1e-3, 2e-3, -1e-3])), np.zeros(3))
     near = language.numbers(turned, given)
     np.testing.assert_allclose(language.pose(near), turned, atol=1e-12)
