@@ -65,11 +65,11 @@ def softer(joint, factor):
 
 @pytest.mark.parametrize("seed", first(1, range(4)))
 def test_without_a_change_nothing_is_claimed(arm, seed):
-    found = later(arm, lambda p: p, seed, anew=seed % 2 == 0)
-    assert found.found == ()
-    assert found.explained
-    assert found.before.rss == pytest.approx(
-        found.before.dof, abs=4 * np.sqrt(2 * found.before.dof)
+    changes = later(arm, lambda p: p, seed, anew=seed % 2 == 0)
+    assert changes.found == ()
+    assert changes.explained
+    assert changes.before.rss == pytest.approx(
+        changes.before.dof, abs=4 * np.sqrt(2 * changes.before.dof)
     )
 
 
@@ -77,38 +77,38 @@ def test_without_a_change_nothing_is_claimed(arm, seed):
 def test_the_growth_at_temperatures_that_were_not_measured_is_no_change():
     grows = studied_arm(CONFIG, "ur3e", 2, poses=30, more=("thermal_growth",))
     assert later(grows, lambda p: p, 3, count=30, warmer=5.0).found == ()
-    (found,) = later(grows, zero(3, 1e-3), 3, count=30, warmer=5.0).found
-    assert found.candidate.name == "encoder_offset.j3"
+    (change,) = later(grows, zero(3, 1e-3), 3, count=30, warmer=5.0).found
+    assert change.candidate.name == "encoder_offset.j3"
 
 
 def test_the_drift_of_the_tracker_in_one_campaign_is_no_change(arm):
     rate = -5e-8 * np.array([1.0, 0.5, -1.0, 0.3, -0.3, 0.15])
-    found = later(arm, lambda p: p.with_effect("tracker_drift", rate), 3, count=30)
-    assert found.found == ()
-    assert found.explained
+    changes = later(arm, lambda p: p.with_effect("tracker_drift", rate), 3, count=30)
+    assert changes.found == ()
+    assert changes.explained
 
 
 @pytest.mark.parametrize("changed", first(1, [False, True]))
 def test_a_gross_error_is_no_change_and_hides_none(arm, changed):
-    found = later(arm, zero(5, -1.5e-3) if changed else lambda p: p, 13, count=20, off=6)
-    (gross,) = found.gross
+    changes = later(arm, zero(5, -1.5e-3) if changed else lambda p: p, 13, count=20, off=6)
+    (gross,) = changes.gross
     assert gross.pose == "p7"
     assert gross.off_m == pytest.approx(5e-3, rel=0.1)
-    assert [c.candidate.name for c in found.found] == ["encoder_offset.j5"] * changed
-    assert found.explained
+    assert [c.candidate.name for c in changes.found] == ["encoder_offset.j5"] * changed
+    assert changes.explained
 
 
 @pytest.mark.long
 def test_a_joints_new_zero_and_compliance_are_found_with_their_size(arm):
     true = arm.world.physics.joint_compliance[1]
-    found = later(arm, lambda p: softer(2, 2.0)(zero(5, -1.5e-3)(p)), 11)
-    by_name = {c.candidate.name: c.sizes[0] for c in found.found}
+    changes = later(arm, lambda p: softer(2, 2.0)(zero(5, -1.5e-3)(p)), 11)
+    by_name = {c.candidate.name: c.sizes[0] for c in changes.found}
     assert set(by_name) == {"encoder_offset.j5", "joint_compliance.j2"}
     assert abs(by_name["encoder_offset.j5"].value + 1.5e-3) < 4 * by_name["encoder_offset.j5"].std
     moved = by_name["joint_compliance.j2"]
     assert abs(moved.value - true) < 4 * moved.std
     assert moved.before[0] == pytest.approx(true, abs=5 * moved.before[1])
-    assert found.explained
+    assert changes.explained
 
 
 @pytest.mark.long
@@ -123,8 +123,8 @@ def test_a_zero_of_joint_1_is_the_trackers_new_place_unless_that_is_the_old_one(
 @pytest.mark.long
 def test_a_target_that_was_mounted_anew_is_no_change_of_the_arm(arm):
     shift = np.array([4e-3, -2e-3, 1e-3])
-    found = later(arm, lambda p: p.with_effect("target_offset", p.target_offset + shift), 13)
-    (moved,) = found.found
+    changes = later(arm, lambda p: p.with_effect("target_offset", p.target_offset + shift), 13)
+    (moved,) = changes.found
     assert moved.candidate.name == "target_offset"
     assert not moved.candidate.of_arm
     assert np.abs([s.value for s in moved.sizes] - shift).max() < 5e-5
@@ -132,10 +132,10 @@ def test_a_target_that_was_mounted_anew_is_no_change_of_the_arm(arm):
 
 def test_the_last_link_and_the_target_are_not_told_apart_by_what_positions_do_not_show(arm):
     moved = 1e-4 * np.array([3.0, -2.0, 3.0, 4.0, -3.0, 3.0]) * np.eye(7)[6][:, None]
-    found = later(
+    changes = later(
         arm, lambda p: p.with_effect("link_geometry", p.link_geometry + moved), 46, count=20
     )
-    (change,) = found.found
+    (change,) = changes.found
     assert {c.name for c in change.possible} == {"target_offset", "link_geometry.link6"}
     assert max(abs(s.value) for s in change.sizes) < 1e-3
 
@@ -195,14 +195,14 @@ def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm):
     model = with_effects(arm.cell, r, "absolute", ("joint_compliance",))  # much fewer than poses
     of_pose = off * rng.standard_normal((int(r.pose.max()) + 1, 3))[r.pose]
     of_reading = off * rng.standard_normal((len(r), 3))
-    found = [
+    fits = [
         earlier_fit(hc.fit(model, replace(r, value=r.value + shift), readings="absolute"))
         for shift in (of_pose, of_reading)
     ]
-    w = found[0].fit.whitening
+    w = fits[0].fit.whitening
     drawn = float(np.mean(w.whiten(of_pose[w.reading]) ** 2))
-    assert found[0].pose_variance == pytest.approx(
+    assert fits[0].pose_variance == pytest.approx(
         drawn, rel=0.3
     )  # some of the 90 values are fitted
-    assert found[0].pose_variance > 5 * found[0].noise
-    assert found[1].pose_variance < 0.5 * found[1].noise  # parameters are shared by a pose, too
+    assert fits[0].pose_variance > 5 * fits[0].noise
+    assert fits[1].pose_variance < 0.5 * fits[1].noise  # parameters are shared by a pose, too

@@ -74,9 +74,9 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict(effect):
     assert headline(d) == "adequate for deflections; geometry is not calibrated"
     assert "Geometry is not calibrated" in message(d)
     assert "No effect of the catalogue" not in message(d)
-    told = d.to_dict()
-    assert effect in told["not_shown"]
-    assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
+    document = d.to_dict()
+    assert effect in document["not_shown"]
+    assert {s["effect"] for s in document["suspects"] if not s["shown"]} >= set(d.not_shown)
     table = "\n".join(str(x) for x in detectable_sizes(d) if isinstance(x, str))
     assert effect in table.partition("These readings cannot show, at any plausible size:")[2]
 
@@ -94,17 +94,17 @@ def test_a_hidden_effect_leads(effect, mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
-    found = fitted_baseline(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
-    p = linearise(found)
+    fitted = fitted_baseline(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
+    p = linearise(fitted)
     some = ("base_compliance", "hysteresis", "joint_tilt_compliance")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
     assert len(suspects) == len(some)
     for s in suspects:
-        after = add(found, s.effect)
-        rank, rest = s.score.rank, found.dof - s.score.rank
+        after = add(fitted, s.effect)
+        rank, rest = s.score.rank, fitted.dof - s.score.rank
         # Frames with a prior are learnt a little less well beside more parameters.
         assert after.dof == pytest.approx(rest, abs=0.2)
-        ratio = (found.chi2 - after.chi2) / rank / (after.chi2 / rest)
+        ratio = (fitted.chi2 - after.chi2) / rank / (after.chi2 / rest)
         assert s.score.p_value > 1e-200
         # One linear step against the converged refit.
         assert f_distribution.isf(s.score.p_value, rank, rest) == pytest.approx(ratio, rel=0.03)
@@ -219,8 +219,8 @@ def test_an_effect_in_time_may_be_one_in_an_air_temperature_that_rises_with_it(w
     states = replace(c.readings.states, air_temperature=air, joint_temperature=None)
     before = fitted_baseline(c, readings=replace(c.readings, states=states))
     for d in (diagnose(before), diagnose(add(before, "tracker_drift"))):  # suspected, and named
-        found = next((x for x in d.confounded if x.effect == "tracker_drift"), None)
-        assert (() if found is None else found.instead) == instead
+        confounded = next((x for x in d.confounded if x.effect == "tracker_drift"), None)
+        assert (() if confounded is None else confounded.instead) == instead
         assert ("could as well follow the air temperature" in message(d)) == bool(instead)
         assert len(d.to_dict()["confounded"]) == len(d.confounded)
 
@@ -231,14 +231,14 @@ def test_a_variable_in_place_of_another_stays_within_its_range():
     air[np.argmin(air)] -= 1.0  # by the others, a time under load below zero
     states = replace(c.readings.states, air_temperature=air, joint_temperature=None)
     before = fitted_baseline(c, readings=replace(c.readings, states=states))
-    (found,) = diagnose(add(before, "creep")).confounded
-    assert (found.effect, found.instead) == ("creep", ("air temperature",))
+    (confounded,) = diagnose(add(before, "creep")).confounded
+    assert (confounded.effect, confounded.instead) == ("creep", ("air temperature",))
 
 
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
-    found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    refusal("diagnosis needs a fit with scaling gc, this one has none", diagnose, found)
+    fitted = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
+    refusal("diagnosis needs a fit with scaling gc, this one has none", diagnose, fitted)
 
 
 def test_effects_that_need_missing_columns_are_no_suspects():
@@ -270,7 +270,7 @@ class Repeated:
         return motion(cell, p.observation, chain, p.deviation, self.clean.m).dq
 
 
-def found(r, readings):
+def pure_error_of(r, readings):
     return pure_error(r.fit(readings))
 
 
@@ -278,7 +278,7 @@ def null_p_values(mode, m, seeds):
     r, rng = Repeated(mode, 6, m=m), np.random.default_rng(1)
     pure, lack = [], []
     for _ in range(seeds):
-        e = found(r, with_noise(r.clean, rng))
+        e = pure_error_of(r, with_noise(r.clean, rng))
         pure.append(chi2.sf(e.factor * e.dof, e.dof))
         lack.append(e.lack_of_fit_p)
     return pure, lack
@@ -303,7 +303,7 @@ def test_estimated_covariances_do_not_bias_the_factor(mode):
         z = rng.standard_normal((len(r.clean), 9, m))
         estimate = (20 * np.eye(m) + np.swapaxes(z, 1, 2) @ z) / 29
         covariance = root @ estimate @ np.swapaxes(root, 1, 2)
-        e = found(r, replace(with_noise(r.clean, rng), covariance=covariance))
+        e = pure_error_of(r, replace(with_noise(r.clean, rng), covariance=covariance))
         factors.append(e.factor)
     # 4 σ of the mean; uncorrected, the factor would be 1.07.
     assert np.mean(factors) == pytest.approx(1, abs=4 * np.sqrt(2 / e.dof / len(factors)))
@@ -312,7 +312,7 @@ def test_estimated_covariances_do_not_bias_the_factor(mode):
 def test_drift_and_friction_between_repeats_are_not_noise():
     for effect in ("hysteresis", "tracker_drift"):
         r = Repeated("absolute", 10, effect=effect)
-        e = found(r, with_noise(r.clean, np.random.default_rng(3)))
+        e = pure_error_of(r, with_noise(r.clean, np.random.default_rng(3)))
         assert e.lack_of_fit_p < 1e-6
         assert e.factor == pytest.approx(1, abs=4 * np.sqrt(2 / e.dof))
 
@@ -328,8 +328,8 @@ def spoilt(r, what, rng):
         value += r.motion()[:, :, int(what[-1]) - 1] * 4e-5 * draw
     else:
         name = "none" if what == "unloaded" else what
-        mine = np.array(r.clean.load_names)[r.clean.load] == name
-        value[mine] += 2 * (read.value - r.clean.value)[mine]
+        of_load = np.array(r.clean.load_names)[r.clean.load] == name
+        value[of_load] += 2 * (read.value - r.clean.value)[of_load]
     return replace(read, value=value)
 
 
@@ -339,7 +339,7 @@ def spoilt(r, what, rng):
 )
 def test_the_direction_that_scatters_is_named(mode, what):
     r = Repeated(mode, 20, missing=0.0)
-    e = found(r, spoilt(r, what, np.random.default_rng(0)))
+    e = pure_error_of(r, spoilt(r, what, np.random.default_rng(0)))
     assert e.where.name == what
     assert e.where.p_value < 1e-3
     assert e.where.interval[0] > 1.5

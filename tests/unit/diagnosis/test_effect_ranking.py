@@ -53,12 +53,12 @@ def test_no_error_of_second_order_is_named_for_deflections(law, robot):
 
 def test_the_cell_may_allow_more():
     c = campaign("none", "absolute", 1)
-    found = fitted_baseline(c)
+    fitted = fitted_baseline(c)
 
     def largest(factor):
         config = configuration().model_copy(update={"plausible": factor})
-        cell = replace(found.model.cell, config=config)
-        same = replace(found, model=replace(found.model, cell=cell))
+        cell = replace(fitted.model.cell, config=config)
+        same = replace(fitted, model=replace(fitted.model, cell=cell))
         (e,) = (e for e in candidates(same) if e.name == "link_geometry")
         return e.most()
 
@@ -70,13 +70,13 @@ def test_the_cell_may_allow_more():
 def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
     """A geometry that is off by so much is allowed as much, and not ten times as much."""
     c = campaign("link_geometry", "absolute", 1, strength=10.0)
-    found = fitted_baseline(replace(c, mode="deflection"))
-    (e,) = (e for e in candidates(found) if e.name == "link_geometry")
+    fitted = fitted_baseline(replace(c, mode="deflection"))
+    (e,) = (e for e in candidates(fitted) if e.name == "link_geometry")
     off = c.world.physics.link_geometry
-    allowed = largest_plausible(effect_columns(found, e), unloaded_readings(found))
+    allowed = largest_plausible(effect_columns(fitted, e), unloaded_readings(fitted))
     true = float(np.sqrt(np.mean((1e3 * off) ** 2)))
     assert true < allowed < 10 * true
-    assert largest_plausible(effect_columns(found, e), None) == pytest.approx(e.most())
+    assert largest_plausible(effect_columns(fitted, e), None) == pytest.approx(e.most())
 
 
 POSES = 30
@@ -96,9 +96,9 @@ def without_loads(seed, stiff):
 
 def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant():
     for seed in range(2):
-        found = without_loads(seed, stiff=True)
-        p = linearise(found)
-        effects = candidates(found)
+        fitted = without_loads(seed, stiff=True)
+        p = linearise(fitted)
+        effects = candidates(fitted)
         elastic = {e.name for e in effects if acts_through_load(e)}
         assert {"joint_compliance", "link_mass", "load_point"} <= elastic
         assert not {"link_geometry", "transmission_error", "hysteresis"} & elastic
@@ -106,14 +106,14 @@ def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant():
         geometry = geometry_columns(p, effects)
         for e in effects:
             if e.name in elastic:
-                assert not beyond_geometry(p, effect_columns(found, e), geometry), e.name
+                assert not beyond_geometry(p, effect_columns(fitted, e), geometry), e.name
 
 
 def test_gravity_tells_of_a_compliant_arm():
-    found = without_loads(0, stiff=False)
-    p, effects = linearise(found), candidates(found)
+    fitted = without_loads(0, stiff=False)
+    p, effects = linearise(fitted), candidates(fitted)
     (e,) = (e for e in effects if e.name == "joint_compliance")
-    assert beyond_geometry(p, effect_columns(found, e), geometry_columns(p, effects))
+    assert beyond_geometry(p, effect_columns(fitted, e), geometry_columns(p, effects))
     assert "joint_compliance" in {s.effect for s in rank_suspects(p, effects) if s.passes}
 
 
@@ -148,22 +148,22 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
 
 def test_refine_lets_them_differ_and_names_no_other_effect(arm):
     start = with_joints(arm, "common")
-    found = refine(start.model, arm.readings, "deflection")
-    assert [s.added for s in found.steps] == [None, EACH]
-    assert found.verdict == "adequate"
-    assert found.fit.model.names == start.model.names
-    own = found.fit.model.effects[-1]
-    assert own.options["joints"] == "each"
+    refinement = refine(start.model, arm.readings, "deflection")
+    assert [s.added for s in refinement.steps] == [None, EACH]
+    assert refinement.verdict == "adequate"
+    assert refinement.fit.model.names == start.model.names
+    compliance = refinement.fit.model.effects[-1]
+    assert compliance.options["joints"] == "each"
     again = with_joints(arm, "each")
-    np.testing.assert_allclose(found.fit.theta, again.theta, rtol=1e-6)
-    assert found.fit.chi2 == pytest.approx(again.chi2, rel=1e-8)
+    np.testing.assert_allclose(refinement.fit.theta, again.theta, rtol=1e-6)
+    assert refinement.fit.chi2 == pytest.approx(again.chi2, rel=1e-8)
 
 
 def test_a_finer_form_is_no_alternative_to_the_effect(arm):
     c = campaign("creep", "deflection", 1, poses=12, strength=3.0)
-    found = add(with_joints(c, "each"), "creep")
-    assert "creep(joints=each)" in [e.name for e in candidates(found)]
-    alternative = StepwiseAlternatives(found).of("creep")
+    fitted = add(with_joints(c, "each"), "creep")
+    assert "creep(joints=each)" in [e.name for e in candidates(fitted)]
+    alternative = StepwiseAlternatives(fitted).of("creep")
     assert not any("creep" in name for name in (*alternative.same_as, *alternative.replacements))
 
 
@@ -186,11 +186,11 @@ def test_others_that_leave_a_misfit_are_no_alternative_whatever_their_evidence()
             model = model + model.catalogue.make(name, c.cell, readings.states)
         return fit(model, readings, "absolute")
 
-    found = fitted("transmission_error")
-    a = StepwiseAlternatives(found).of("transmission_error")
+    result = fitted("transmission_error")
+    a = StepwiseAlternatives(result).of("transmission_error")
     others = fitted(*a.replacements)
     assert a.log_evidence > a.effect_log_evidence - SAME_EVIDENCE
-    assert not is_misfit(found.chi2, found.dof)
+    assert not is_misfit(result.chi2, result.dof)
     assert is_misfit(others.chi2, others.dof)
     assert not a.inseparable
 
@@ -224,13 +224,13 @@ def test_finer_is_what_splits_groups_and_keeps_joints(arm, groups):
 ERROR = "transmission_error"
 
 
-def found(poses):
+def without_effect(poses):
     c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
     return fitted_baseline(c)
 
 
 def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve():
-    f = found(16)  # with 12 it depends on the draw whether any size would be seen
+    f = without_effect(16)  # with 12 it depends on the draw whether any size would be seen
     p = linearise(f)
     (e,) = (e for e in candidates(f) if e.name == ERROR)
     (s,) = rank_suspects(p, [e])
@@ -260,8 +260,8 @@ def test_an_effect_of_that_size_is_named_as_often_as_said():
             there = campaign(effect, "deflection", seed, poses=20, plan_seed=0, strength=sigma)
             sigma *= least / displacement(there, empty)
         there = campaign(effect, "deflection", seed, poses=20, plan_seed=0, strength=sigma)
-        found = diagnose(fitted_baseline(there)).suspects
-        named.append(any(s.effect == effect and s.passes for s in found))
+        suspects_there = diagnose(fitted_baseline(there)).suspects
+        named.append(any(s.effect == effect and s.passes for s in suspects_there))
     assert np.count_nonzero(named) >= 7
 
 
@@ -279,7 +279,7 @@ def displacement(there, empty):
 def test_more_poses_show_smaller_ones():
     sizes = []
     for poses in (12, 30):
-        f = found(poses)
+        f = without_effect(poses)
         (e,) = (e for e in candidates(f) if e.name == ERROR)
         sizes.append(rank_suspects(linearise(f), [e])[0].least.displacement_m)
     assert sizes[1] < 0.6 * sizes[0]

@@ -132,8 +132,8 @@ NAMES = ("joint_compliance", HIDDEN)
 def before():
     """A campaign of an arm whose joints tilt, and what it taught."""
     c = campaign(HIDDEN, "absolute", 1, poses=20, registration_known=True)
-    found = fitted_model(c.cell, c.readings, "absolute", NAMES)
-    return c, carried_prior(Posterior.of(found))
+    fitted = fitted_model(c.cell, c.readings, "absolute", NAMES)
+    return c, carried_prior(Posterior.of(fitted))
 
 
 @cache
@@ -155,10 +155,10 @@ def with_prior(*, repaired, poses=10):
 
 def test_the_evidence_is_the_ratio_of_normal_densities_of_the_readings():
     """Against the densities written out, flat parameters with a wide prior instead."""
-    found = with_prior(repaired=True, poses=3)
-    model, s, p = found.model, found.solution, before()[1].posterior
+    fitted = with_prior(repaired=True, poses=3)
+    model, s, p = fitted.model, fitted.solution, before()[1].posterior
     assert carried_effects(model) == (HIDDEN,)
-    a = whitened_jacobian(model, s.prediction, s.theta, found.whitening, np.arange(model.size))
+    a = whitened_jacobian(model, s.prediction, s.theta, fitted.whitening, np.arange(model.size))
     y = s.white + a @ s.theta
     drift = model.prior.drift if model.prior is not None else np.zeros(0)
     c = (1 + drift[0] ** 2) * np.linalg.inv(p.information)
@@ -168,15 +168,15 @@ def test_the_evidence_is_the_ratio_of_normal_densities_of_the_readings():
     def density(names):
         mean, cov = np.zeros(len(y)), s.beta * np.eye(len(y))
         kept = [k for k, name in enumerate(p.names) if name.split(".")[0] in names]
-        own = [list(names_of(model)).index(p.names[k]) for k in kept]
-        mean = a[:, own] @ p.mean[kept]
-        cov += a[:, own] @ c[np.ix_(kept, kept)] @ a[:, own].T
+        columns = [list(names_of(model)).index(p.names[k]) for k in kept]
+        mean = a[:, columns] @ p.mean[kept]
+        cov += a[:, columns] @ c[np.ix_(kept, kept)] @ a[:, columns].T
         flat = np.delete(a, [list(names_of(model)).index(n) for n in p.names], axis=1)
         cov += 1e4**2 * flat @ flat.T
         return float(multivariate_normal(mean, cov).logpdf(y))
 
     expected = density(("joint_compliance", HIDDEN)) - density(("joint_compliance",))
-    evidence = evidence_of_carried(model, s, found.whitening, (HIDDEN,))[HIDDEN]
+    evidence = evidence_of_carried(model, s, fitted.whitening, (HIDDEN,))[HIDDEN]
     assert evidence == pytest.approx(expected, rel=1e-3)
     assert abs(expected) > 1
 
@@ -223,8 +223,8 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
     p_values = []
     for seed in range(30):
         c = campaign(NO_EFFECT, mode, seed, poses=12, plan_seed=1, registration_known=True)
-        found = fitted_baseline(c, *effects)
-        judged = {n: score.p_value for n, score in backward_elimination(found).items()}
+        fitted = fitted_baseline(c, *effects)
+        judged = {n: score.p_value for n, score in backward_elimination(fitted).items()}
         p_values += [judged.get(name, 0.0) for name in effects]
     assert set(effects) >= set(judged)
     kept = sum(p < REDUNDANCY_LEVEL for p in p_values)
@@ -248,10 +248,10 @@ def test_an_effect_of_as_many_columns_as_readings_is_not_called_needless():
     gears = evaluate(cell.arm, q + 2e-4 * np.sin(q + np.arange(6)))
     moved = gears.point(cell.target[:3, 3]) - evaluate(cell.arm, q).point(cell.target[:3, 3])
     r = replace(r, value=r.value + moved @ cell.registration[:3, :3].T)
-    found = fitted_baseline(c, "link_geometry", "transmission_error", readings=r)
-    score = eliminate_effect(found, model_columns(found), "transmission_error").score()
+    fitted = fitted_baseline(c, "link_geometry", "transmission_error", readings=r)
+    score = eliminate_effect(fitted, model_columns(fitted), "transmission_error").score()
     assert score.p_value > REDUNDANCY_LEVEL  # 51 columns of 78 numbers
-    assert backward_elimination(found) == {}
+    assert backward_elimination(fitted) == {}
 
 
 def test_an_early_addition_that_became_needless_is_removed():
@@ -296,14 +296,14 @@ def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them(
 
 
 def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
-    found = fitted_baseline(campaign(NO_EFFECT, "deflection", 1), "backlash")
+    fitted = fitted_baseline(campaign(NO_EFFECT, "deflection", 1), "backlash")
     for changed in (
-        lambda: remove(found, "hysteresis"),
-        lambda: exchange(found, "hysteresis", "creep"),
+        lambda: remove(fitted, "hysteresis"),
+        lambda: exchange(fitted, "hysteresis", "creep"),
     ):
         refusal("hysteresis is not in the model", changed)
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
-        exchange(found, "backlash", "joint_compliance")
+        exchange(fitted, "backlash", "joint_compliance")
 
 
 def test_a_family_that_fails_its_test_hides_no_other(monkeypatch):

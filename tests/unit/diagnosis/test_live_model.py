@@ -22,10 +22,10 @@ def quiet():
 
 
 @cache
-def told(seed):
-    """Each reading's judgement, itself, and its true deflection against the reference.
+def judgements(seed):
+    """Of each reading: its judgement, itself, its distance from the first unloaded one of its pose.
 
-    Load by load, half of the unloaded readings after all of them, as in a plan against drift.
+    The order is load by load; half of the unloaded readings come last, as in a plan against drift.
     """
     c = campaign(seed=seed, poses=16)
     late = c.readings.unloaded & (c.readings.pose % 2 == 1)
@@ -44,9 +44,9 @@ def told(seed):
 def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right():
     early, late, first_loads, unsure = [], [], [], 0
     for seed in SEEDS:
-        seen = [(j, r) for j, r, _ in told(seed) if j.sigma is not None]
-        known = [j for j, _ in seen]
-        first_loads += [j.sigma for j, r in seen if not r.unloaded[0]][:12]
+        pairs = [(j, r) for j, r, _ in judgements(seed) if j.sigma is not None]
+        known = [j for j, _ in pairs]
+        first_loads += [j.sigma for j, r in pairs if not r.unloaded[0]][:12]
         assert not any(j.uncertain for j in known[-12:])
         unsure += sum(j.uncertain for j in known[:12])
         early += [j.sigma for j in known[:12]]
@@ -63,7 +63,7 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
     off = []
     for seed in SEEDS:
         begun = False
-        for judged, reading, true in told(seed):
+        for judged, reading, true in judgements(seed):
             begun = begun or judged.deflection is not None
             if reading.unloaded[0]:
                 assert judged.deflection is None
@@ -76,7 +76,7 @@ def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
 
 @pytest.mark.long
 def test_nothing_is_told_before_there_are_poses_to_learn_from():
-    judged = [j for j, _, _ in told(0)[:7]]
+    judged = [j for j, _, _ in judgements(0)[:7]]
     assert judged == [LiveResidual()] * len(judged)
 
 
@@ -85,10 +85,12 @@ def test_words_tell_what_is_measured_from_what_is_inferred():
         return reading_text(ReadingStored(Step("p1", "5kg", 0), 1, 2, 0.0, **more))
 
     assert words() == ""
-    seen = LiveResidual(50e-6, 1.04, False, 4.2138e-3, 52e-6)
-    assert words(deflection=4.2e-3, live=seen) == ": deflection 4.20 mm, residual 50.0 µm (1.0 σ)"
+    residual = LiveResidual(50e-6, 1.04, False, 4.2138e-3, 52e-6)
+    assert (
+        words(deflection=4.2e-3, live=residual) == ": deflection 4.20 mm, residual 50.0 µm (1.0 σ)"
+    )
     expected = ": deflection ≈ 4.214 ± 0.052 mm, residual 50.0 µm (1.0 σ)"
-    assert words(live=seen) == expected
+    assert words(live=residual) == expected
     learning = LiveResidual(2e-3, 0.8, True)
     assert words(live=learning) == ": residual 2.00 mm (0.8 σ, few readings yet)"
     assert (

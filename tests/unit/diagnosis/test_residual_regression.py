@@ -84,15 +84,15 @@ def hidden(name, mode, seed, strength=3.0, poses=30):
     return replace(c, readings=replace(c.readings, states=s, value=c.readings.value + moved(a)))
 
 
-def told(c):
+def regression_of(c):
     return residual_regression(linearise(fitted_baseline(c)))
 
 
 QUICK = range(1)  # seeds
 
 
-def right(name, found):
-    return bool({v.variable for v in found.dependences[:2]} & LAWS[name][2])
+def right(name, regression):
+    return bool({v.variable for v in regression.dependences[:2]} & LAWS[name][2])
 
 
 @pytest.mark.parametrize(
@@ -103,10 +103,10 @@ def right(name, found):
     ],
 )
 def test_its_variable_is_among_the_first_two(name, mode, seeds):
-    found = [told(hidden(name, mode, seed)) for seed in seeds]
-    assert sum(right(name, each) for each in found) >= 0.9 * len(seeds)
+    regressions = [regression_of(hidden(name, mode, seed)) for seed in seeds]
+    assert sum(right(name, each) for each in regressions) >= 0.9 * len(seeds)
     if seeds == QUICK:
-        assert all(each.share > 0.5 for each in found)
+        assert all(each.share > 0.5 for each in regressions)
 
 
 FOREIGN = {  # laws of the study of `discover`: what carries each, what errs, and its axes
@@ -124,12 +124,12 @@ FOREIGN = {  # laws of the study of `discover`: what carries each, what errs, an
 @pytest.mark.parametrize("law", first(2, list(FOREIGN)))
 def test_what_carries_a_law_of_mechanics_and_what_errs_are_told(law):
     case = simulated(configuration(), DiscoveryCase("ur5e", KINDS[law][0], law))
-    found = residual_regression(linearise(case.before))
+    regression = residual_regression(linearise(case.before))
     variables, moves, axes = FOREIGN[law]
-    assert found.share > 0.8
-    assert found.significant
-    assert {d.variable for d in found.dependences[: len(variables)]} <= variables
-    assert (found.dependences[0].moves, found.dependences[0].axes) == (moves, axes)
+    assert regression.share > 0.8
+    assert regression.significant
+    assert {d.variable for d in regression.dependences[: len(variables)]} <= variables
+    assert (regression.dependences[0].moves, regression.dependences[0].axes) == (moves, axes)
 
 
 def test_a_loop_of_hysteresis_that_is_as_wide_as_the_torque_is_large():
@@ -143,9 +143,12 @@ def test_a_loop_of_hysteresis_that_is_as_wide_as_the_torque_is_large():
     states = replace(c.readings.states, approach=side)
     readings = replace(c.readings, states=states, value=c.readings.value + moved - at)
     effects = ("joint_compliance", "hysteresis")
-    found = residual_regression(linearise(fitted_model(c.cell, readings, "absolute", effects)))
-    assert found.share > 0.8
-    assert {v.variable for v in found.dependences[:2]} == {"joint 2 approach", "joint 2 torque"}
+    regression = residual_regression(linearise(fitted_model(c.cell, readings, "absolute", effects)))
+    assert regression.share > 0.8
+    assert {v.variable for v in regression.dependences[:2]} == {
+        "joint 2 approach",
+        "joint 2 torque",
+    }
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
@@ -153,14 +156,14 @@ def test_noise_is_not_predictable(mode):
     for seed in range(2):
         c = campaign("none", mode, seed, poses=20)
         c = replace(c, readings=replace(c.readings, states=warm(c.readings.states, seed)))
-        found = told(c)
-        assert found.share < 0.05
-        assert found.dependences == ()
+        regression = regression_of(c)
+        assert regression.share < 0.05
+        assert regression.dependences == ()
 
 
 def curve_of(name, variable):
     c = hidden(name, "absolute", 1, strength=6.0, poses=40)
-    return c, next(v for v in told(c).dependences if v.variable == variable)
+    return c, next(v for v in regression_of(c).dependences if v.variable == variable)
 
 
 def test_the_curve_is_the_law():
@@ -205,13 +208,13 @@ def test_equal_to_dense_columns(mode, effects):
     some = baseline(c.cell, c.readings, mode)
     model = some if effects is None else with_effects(c.cell, c.readings, mode, effects)
     p = linearise(fit(model, c.readings, mode))
-    found, u = pose_constants(p), dense(p)
-    assert found.rank == u.shape[1]
+    constants, u = pose_constants(p), dense(p)
+    assert constants.rank == u.shape[1]
     if mode == "absolute" and effects is None:  # a shift of the base is one of all poses
-        assert found.rank < 36
-    assert found.gain == pytest.approx(float(np.sum((u.T @ p.residual) ** 2)), rel=1e-6)
+        assert constants.rank < 36
+    assert constants.gain == pytest.approx(float(np.sum((u.T @ p.residual) ** 2)), rel=1e-6)
     x = np.random.default_rng(0).standard_normal((len(p.residual), 4))
-    assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
+    assert constants.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
 
 
 def test_a_single_pose_does_not_show_what_the_pose_alone_predicts():

@@ -35,10 +35,10 @@ def campaign(rho, mode="absolute", seed=0, hidden="", poses=10):
 @pytest.mark.parametrize("rho", first(1, [0.9, 0.7, 0.99]))
 @pytest.mark.long
 def test_the_correlation_comes_out(mode, rho):
-    found = serial_noise(fitted_model(*campaign(rho, mode), mode))
-    assert found.proved
+    noise = serial_noise(fitted_model(*campaign(rho, mode), mode))
+    assert noise.proved
     # In deflections half of the noise is of unloaded readings: less is known of it.
-    assert abs(np.log1p(-found.rho) - np.log1p(-rho)) < (0.6 if mode == "absolute" else 1.2)
+    assert abs(np.log1p(-noise.rho) - np.log1p(-rho)) < (0.6 if mode == "absolute" else 1.2)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -52,25 +52,25 @@ def test_white_noise_is_left_as_it_is(mode):
 @pytest.mark.long
 def test_nothing_is_named_for_it_and_it_is_said(mode):
     cell, readings = campaign(0.9, mode, 3)
-    found = refined(cell, readings, mode)
-    serial = found.fit.readings.serial
-    assert found.fit.model.names == ("base_frame", "joint_compliance")
-    assert found.verdict == "adequate"
-    said = message(found.diagnosis)
+    refinement = refined(cell, readings, mode)
+    serial = refinement.fit.readings.serial
+    assert refinement.fit.model.names == ("base_frame", "joint_compliance")
+    assert refinement.verdict == "adequate"
+    said = message(refinement.diagnosis)
     assert "correlated along their order" in said
     assert "half-time" in said
-    document = found.diagnosis.to_dict()["serial_noise"]
+    document = refinement.diagnosis.to_dict()["serial_noise"]
     assert document["rho"] == serial.rho
     assert document["half"] == pytest.approx(serial.length * np.log(2))
 
 
 def test_intervals_of_a_frame_are_wider_and_of_differences_narrower():
     white = fitted_model(*campaign(0.9), "absolute")
-    found = with_serial_noise(white)
-    low, high = found.readings.serial.wider
+    fitted = with_serial_noise(white)
+    low, high = fitted.readings.serial.wider
     assert low < 0.7
     assert high > 1.5
-    before, after = white.parameters["base_frame.x"].std, found.parameters["base_frame.x"].std
+    before, after = white.parameters["base_frame.x"].std, fitted.parameters["base_frame.x"].std
     assert after > 1.5 * before
 
 
@@ -85,20 +85,20 @@ def test_how_much_wider_is_said_once(wider, words):
 
 def test_a_fit_with_it_is_found_again():
     cell, readings = campaign(0.9, "deflection")
-    found = with_serial_noise(fitted_model(cell, readings, "deflection"))
-    record = to_record(found, None, None, content_hash(found.readings))
+    fitted = with_serial_noise(fitted_model(cell, readings, "deflection"))
+    record = to_record(fitted, None, None, content_hash(fitted.readings))
     again = restore(record, cell, readings)
-    assert again.readings.serial == found.readings.serial
-    np.testing.assert_allclose(again.theta, found.theta, rtol=1e-6)
-    np.testing.assert_allclose(again.uncertainty.std, found.uncertainty.std, rtol=1e-4)
+    assert again.readings.serial == fitted.readings.serial
+    np.testing.assert_allclose(again.theta, fitted.theta, rtol=1e-6)
+    np.testing.assert_allclose(again.uncertainty.std, fitted.uncertainty.std, rtol=1e-4)
 
 
 @pytest.mark.long
 def test_what_effects_explain_as_well_is_in_doubt():
-    found = with_serial_noise(fitted_model(*campaign(0.9), "absolute"))
-    serial = found.readings.serial
+    fitted = with_serial_noise(fitted_model(*campaign(0.9), "absolute"))
+    serial = fitted.readings.serial
     doubt = replace(serial, proved=False, instead=("tracker_drift",))
-    d = diagnose(replace(found, readings=found.readings.with_serial(doubt)))
+    d = diagnose(replace(fitted, readings=fitted.readings.with_serial(doubt)))
     assert d.reason == "serial_or_effect"
     assert VERDICTS[d.reason] == "ambiguous"
     assert "tracker_drift would explain the readings as well" in message(d)
@@ -115,10 +115,10 @@ def test_times_tell_a_pause():
     z[1::2] = 0.95 * z[::2] + np.sqrt(1 - 0.95**2) * z[1::2]
     root = symmetric_root(readings.covariance)
     value = clean + np.einsum("nij,nj->ni", root, z)
-    told = replace(readings, value=value, states=replace(readings.states, time=time))
-    found = serial_noise(fitted_model(cell, told, "absolute"))
-    assert found.clock == "time"
-    assert 5.0 < found.length < 500.0
+    in_pairs = replace(readings, value=value, states=replace(readings.states, time=time))
+    noise = serial_noise(fitted_model(cell, in_pairs, "absolute"))
+    assert noise.clock == "time"
+    assert 5.0 < noise.length < 500.0
 
 
 def test_a_few_readings_and_very_many_are_not_judged():

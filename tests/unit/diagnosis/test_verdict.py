@@ -169,8 +169,8 @@ def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
     # Their zero mean leaves what a scale of some per cent would explain; ordinary ones have 1e-5.
     case = case_of("deflection", ("joint_stiffening",), 1.0)
     first = fitted_model(case.cell, case.readings, "deflection")
-    found = with_background(first, first.model.names)
-    tested = {b.effect: b for b in background_evidence(found)}
+    fitted = with_background(first, first.model.names)
+    tested = {b.effect: b for b in background_evidence(fitted)}
     assert tested["tracker_scale"].p_value > 0.05
     assert proved(tuple(tested.values())) == ("joint_stiffening",)
 
@@ -178,11 +178,11 @@ def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
 @pytest.mark.long
 def test_a_model_with_shrunk_lines_is_refined_further():
     case = case_of("absolute", ("transmission_error",), 3.0)
-    found = refined(case.cell, case.readings, "absolute")
-    assert "transmission_error" in found.fit.model.random
-    assert p_value_of_others(found.fit) > 0.01  # nothing else is there
-    again = refine(found.fit.model, case.readings, "absolute")
-    assert again.verdict == found.verdict == "adequate"
+    refinement = refined(case.cell, case.readings, "absolute")
+    assert "transmission_error" in refinement.fit.model.random
+    assert p_value_of_others(refinement.fit) > 0.01  # nothing else is there
+    again = refine(refinement.fit.model, case.readings, "absolute")
+    assert again.verdict == refinement.verdict == "adequate"
 
 
 KNOWN = (True, False, False)
@@ -204,9 +204,9 @@ def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
     """Taken for independent, these readings name a cause: transmission_error in the second."""
     c = reflectors(seed=seed, poses=20, known=KNOWN, joint_std=STD)
     readings = unstated(c)
-    found = fitted_model(c.cell, readings, mode)
-    d = diagnose(found)
-    assert found.variance_factor > 4
+    fitted = fitted_model(c.cell, readings, mode)
+    d = diagnose(fitted)
+    assert fitted.variance_factor > 4
     assert (d.verdict, d.reason, d.significant) == ("adequate", "arm_scatter", ())
     assert d.scatter.kind == "joints"
     assert d.scatter.std[0] == pytest.approx(STD, abs=4 * d.scatter.std_error[0])
@@ -219,10 +219,10 @@ def test_a_suspect_that_few_poses_do_not_confirm_is_no_unknown_effect():
     unsure = replace(lead, left_out=lambda: HeldOut(lead.holdout_share, False))
     others = [replace(s, explains=False) for s in others]
     d = replace(d, reason="no_suspect", suspects=(unsure, *others), predictable_share=0.0)
-    found = with_unconfirmed_suspect(d)
-    assert (found.verdict, found.reason) == ("ambiguous", "unconfirmed_suspect")
-    assert message(found).startswith(lead.effect)
-    assert "--after RUN" in message(found)
+    unconfirmed = with_unconfirmed_suspect(d)
+    assert (unconfirmed.verdict, unconfirmed.reason) == ("ambiguous", "unconfirmed_suspect")
+    assert message(unconfirmed).startswith(lead.effect)
+    assert "--after RUN" in message(unconfirmed)
     two = with_unconfirmed_suspect(replace(d, suspects=(unsure, replace(unsure, effect="creep"))))
     assert in_doubt(two) == (lead.effect, "creep")
     for law in (

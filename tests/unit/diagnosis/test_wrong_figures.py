@@ -75,7 +75,7 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch, at):
     """A trial that does not settle ends no diagnosis; a fit may be that close to the edge."""
     c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     spoilt = doubled(c.readings, "5kg")
-    found = hc.fit(baseline(c.cell, spoilt, "absolute"), spoilt, "absolute")
+    fitted = hc.fit(baseline(c.cell, spoilt, "absolute"), spoilt, "absolute")
     tried = []
 
     def unsettled(*args, **more):
@@ -84,7 +84,7 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch, at):
 
     module = sys.modules[wrong_figures.__module__]
     monkeypatch.setattr(*((module, "fit") if at == "refit" else (Model, "predict")), unsettled)
-    assert wrong_figures(found, ()) == ()
+    assert wrong_figures(fitted, ()) == ()
     assert tried
 
 
@@ -92,9 +92,9 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch, at):
 def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
     c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)
-    found = refined(cell, c.readings, "absolute")
-    (step,) = found.steps
-    assert found.verdict == "ambiguous"
+    refinement = refined(cell, c.readings, "absolute")
+    (step,) = refinement.steps
+    assert refinement.verdict == "ambiguous"
     assert message(step.diagnosis).startswith("The tool seems to weigh 0.8")
     assert "correct [tool] mass_kg" in message(step.diagnosis)
     (figure,) = step.diagnosis.to_dict()["wrong_figures"]
