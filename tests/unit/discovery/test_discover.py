@@ -55,17 +55,17 @@ def campaign(law="", stated=1.0, seed=4):
 
 
 @cache
-def found():
+def discovery():
     return discover(campaign(LAW), name="bent")
 
 
 @pytest.mark.long
 def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
-    law = found().laws[0]
-    assert found().reason == "law"
+    law = discovery().laws[0]
+    assert discovery().reason == "law"
     assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
     assert law.name == "bent"
-    after = found().after
+    after = discovery().after
     assert after.model.names[-1] == "bent"
     assert law.acts_on == ("joint 3",)
     assert set(law.variables) == {"joint 4 angle", "joint 3 torque"}
@@ -78,7 +78,7 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
 def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypatch):
     before, laws = campaign(LAW), LawSearch(tmp_path, "bent")
     monkeypatch.setattr(
-        sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: found()
+        sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: discovery()
     )
     r = refine(before.model, before.readings, before.mode, laws=laws, background=False)
     assert r.steps[0].diagnosis.verdict == "unknown_effect"
@@ -90,11 +90,11 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypa
     assert again.files[0].sha256 == stored.sha256
     states = before.readings.states
     model = before.model + again.make("bent", before.model.cell, states)
-    seen, same = (m.predict(states, r.fit.theta).observation for m in (r.fit.model, model))
-    assert same.position == pytest.approx(seen.position, abs=1e-12)
-    told = "\n".join(str(part) for part in refined_laws(laws))
-    assert "dq_3 = a·cos(q_4)·τ_3" in told
-    assert str(tmp_path / "bent.py") in told
+    original, same = (m.predict(states, r.fit.theta).observation for m in (r.fit.model, model))
+    assert same.position == pytest.approx(original.position, abs=1e-12)
+    printed = "\n".join(str(part) for part in refined_laws(laws))
+    assert "dq_3 = a·cos(q_4)·τ_3" in printed
+    assert str(tmp_path / "bent.py") in printed
     (document,) = laws_json(laws)["discover"]
     assert document["written"] == str(tmp_path / "bent.py")
 
@@ -182,8 +182,8 @@ def test_screening_is_what_the_columns_themselves_give():
     s = screened()
     problem = SearchProblem(s)
     rng = np.random.default_rng(0)
-    seen = np.argwhere(s.square > 0)
-    for site, amplitude in rng.choice(seen, 40, replace=False).tolist():
+    visible = np.argwhere(s.square > 0)
+    for site, amplitude in rng.choice(visible, 40, replace=False).tolist():
         x = problem.columns(LawTerm(((site, amplitude),), 0.0))
         exact = float(s.linear.information(x)[0, 0])
         assert s.square[site, amplitude] == pytest.approx(exact, rel=2e-2)
@@ -200,9 +200,11 @@ def test_columns_of_the_written_effect_are_those_of_the_search():
         form = Form((LawPart(s.sites[site], s.grammar.amplitudes[amplitude], 0),))
         kind = effect_class(source_of_form(form, "tried"), "tried")
         effect = kind(f.model.cell, situation.states)
-        own = effect_columns(f, effect)
-        assert own.white / own.scale == pytest.approx(
-            form.columns(s, situation) / unit_motion(form), rel=1e-6, abs=1e-6 * np.ptp(own.white)
+        columns = effect_columns(f, effect)
+        assert columns.white / columns.scale == pytest.approx(
+            form.columns(s, situation) / unit_motion(form),
+            rel=1e-6,
+            abs=1e-6 * np.ptp(columns.white),
         )
 
 
@@ -212,10 +214,10 @@ def unit_motion(form):
 
 @pytest.mark.long
 def test_the_curve_of_a_law_lies_where_the_readings_are():
-    by_angle, by_torque = found().curves
+    by_angle, by_torque = discovery().curves
     assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")
     assert (by_torque.quantity, by_torque.unit) == ("τ_3", "rad")
-    (a,) = found().laws[0].parameters
+    (a,) = discovery().laws[0].parameters
     x, law = by_angle.line
     assert law == pytest.approx(a.value * np.cos(x), rel=1e-9)
     for c in (by_angle, by_torque):
@@ -224,9 +226,9 @@ def test_the_curve_of_a_law_lies_where_the_readings_are():
         assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=3 / np.sqrt(2 * len(off)))
         assert count.sum() == len(c.x)
         assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
-    told = "".join(str(part) for part in discovery_report(found()))
-    assert "valid for" in told
-    drawn = found().to_dict()["curves"][0]
+    printed = "".join(str(part) for part in discovery_report(discovery()))
+    assert "valid for" in printed
+    drawn = discovery().to_dict()["curves"][0]
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 
 
@@ -296,7 +298,7 @@ def test_a_number_that_the_model_absorbs_is_dropped():
     assert kept.text() == "dq_3 = a·cos(q_4)·τ_3"
     assert [c.name for c in values] == ["a"]
     assert abs(values[0].value) > 10 * values[0].std
-    assert after.variance_factor == pytest.approx(found().laws[0].variance_factor, rel=1e-3)
+    assert after.variance_factor == pytest.approx(discovery().laws[0].variance_factor, rel=1e-3)
     check_effect(kind)
 
 
@@ -321,13 +323,13 @@ def term(p, power):
 def test_a_law_is_told_beside_an_effect_only_where_it_is_another(power, size, more):
     """The cube is what `joint_stiffening` describes; a root of the torque is not."""
     p = problem()
-    own = term(p, power)
-    column = p.model.project_out(p.columns(own))[:, 0]
+    law = term(p, power)
+    column = p.model.project_out(p.columns(law))[:, 0]
     before = p.residual.copy(), p.noise
     p.residual = before[0] + size * column / np.linalg.norm(column)
     p.noise = float(p.residual @ p.residual), p.dof
     known = known_effects(campaign())
-    chosen = Selection((own,), (size**2 / 2,))
+    chosen = Selection((law,), (size**2 / 2,))
     try:
         assert needed_beside_effect(p, chosen, known, "joint_stiffening") is more
     finally:
@@ -369,16 +371,18 @@ def test_no_refit_fails_in_silence(monkeypatch):
         )
         assert effects_replacing_law(fitted, p, near, known).names == known.names
     monkeypatch.setattr(module, "add", fails)
-    found = effects_replacing_law(fitted, p, law, known)
-    assert found == Replacement((), ((known.names[0], "it finds no equilibrium"),))
-    answer = Discovery(fitted, "no_law", unfitted=found.unfitted)
+    replacement = effects_replacing_law(fitted, p, law, known)
+    assert replacement == Replacement((), ((known.names[0], "it finds no equilibrium"),))
+    answer = Discovery(fitted, "no_law", unfitted=replacement.unfitted)
     assert "load_point could not be tried in the exact model (it finds no eq" in no_law_sentence(
         answer
     )
     assert repr(replace(answer, reason="catalogue", catalogue=("creep",))) == (
         "Discovery('catalogue', 'creep')"
     )
-    assert answer.to_dict()["unfitted"] == [{"effect": "load_point", "why": found.unfitted[0][1]}]
+    assert answer.to_dict()["unfitted"] == [
+        {"effect": "load_point", "why": replacement.unfitted[0][1]}
+    ]
 
 
 def _with_load_off(shift):

@@ -251,10 +251,13 @@ def test_an_expression_has_the_value_of_the_law(amplitude):
 
 
 def test_each_site_has_the_sum_of_its_terms():
-    found = law(
+    expressions = law(
         ("dq_3", 2e-4, of("q_3")), ("base_z", 1e-3, of("t")), ("dq_3", -1e-4, of("τ_1"))
     ).expressions
-    assert found == {"dq_3": "0.0002*((q3)) + -0.0001*((tau1))", "base_z": "0.001*((time - 0.0))"}
+    assert expressions == {
+        "dq_3": "0.0002*((q3)) + -0.0001*((tau1))",
+        "base_z": "0.001*((time - 0.0))",
+    }
 
 
 @pytest.mark.parametrize("symbol", ["f_x", "ρ", "z", "mF_x", "gF_z"])
@@ -272,13 +275,13 @@ DRAWN = Form((LawPart(site("dq_3"), of("q_3", shapes.COS, 96.0), 0),))
 @cache
 def fitted(form):
     """A fit with a law that is not there, to readings of 12 poses."""
-    found = campaign_written(NO_EFFECT, "deflection", poses=12)
+    c = campaign_written(NO_EFFECT, "deflection", poses=12)
     source = source_of_form(form, "twisted").encode()
     file = effects_of(source, Path("twisted.py"))
     known = replace(installed().with_effects(*file.effects), files=(file,))
     names = ("base_frame", "joint_compliance", "twisted")
-    model = with_effects(found.cell, found.readings, "deflection", names, {}, known)
-    return fit(model, found.readings, "deflection")
+    model = with_effects(c.cell, c.readings, "deflection", names, {}, known)
+    return fit(model, c.readings, "deflection")
 
 
 @pytest.mark.parametrize(
@@ -287,9 +290,13 @@ def fitted(form):
 )
 def test_a_law_is_drawn_over_what_its_formula_names(form, of, over):
     made = fitted(form)
-    (found,) = drawn_laws(made)
-    assert (found.name, found.formula, found.acts_on) == ("twisted", form.text(), ("joint 3",))
-    (c,) = found.curves
+    (drawn_law,) = drawn_laws(made)
+    assert (drawn_law.name, drawn_law.formula, drawn_law.acts_on) == (
+        "twisted",
+        form.text(),
+        ("joint 3",),
+    )
+    (c,) = drawn_law.curves
     assert (c.of, c.quantity) == (of, over)
     a = made.theta[-1]
     truth = a * np.cos(c.x if "q_5" in over else 96 * c.x)

@@ -19,14 +19,14 @@ from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
 from hilcal.robot import se3
 from tests.support.fit_cases import fitted_model
-from tests.unit.discovery.test_discover import LAW, campaign, found
+from tests.unit.discovery.test_discover import LAW, campaign, discovery
 
 
 def test_probabilities_sum_to_one_with_that_of_no_law():
     """Two members of one structure, one of another, no law: weights 3 + 1, 4 and 1 of 9."""
-    told = posterior({"a": [np.log(3.0), 0.0], "b": [np.log(4.0)]})
-    assert told["a"] == pytest.approx(4 / 9, rel=1e-12)
-    assert told["b"] == pytest.approx(4 / 9, rel=1e-12)
+    probability = posterior({"a": [np.log(3.0), 0.0], "b": [np.log(4.0)]})
+    assert probability["a"] == pytest.approx(4 / 9, rel=1e-12)
+    assert probability["b"] == pytest.approx(4 / 9, rel=1e-12)
     assert posterior({"a": [2000.0], "b": [1990.0]})["b"] == pytest.approx(np.exp(-10), rel=1e-3)
 
 
@@ -37,7 +37,7 @@ def columns(rng):
     return np.asarray(x)
 
 
-def told(x, y):
+def probabilities(x, y):
     rss = float(y @ y)
     odds = {}
     for k in range(x.shape[1]):
@@ -59,14 +59,14 @@ def test_probabilities_are_frequencies_where_laws_are_drawn_from_the_priors():
         k = int(rng.integers(-5, 5))  # none in half of the cases, as `posterior` has it
         if k >= 0:
             y = y + x[:, k] * rng.standard_normal() * rng.choice(STRENGTHS)
-        said += told(x, y).tolist()
+        said += probabilities(x, y).tolist()
         right += [j == k for j in range(5)]
     p, hit = np.array(said), np.array(right)
     for low, high in ((0.0, 0.1), (0.1, 0.5), (0.5, 1.0)):
-        mine = (p > low) & (p <= high)
-        spread = np.sqrt(np.sum(p[mine] * (1 - p[mine])))
-        assert mine.sum() > 50
-        assert abs(hit[mine].sum() - p[mine].sum()) < 3 * spread
+        within = (p > low) & (p <= high)
+        spread = np.sqrt(np.sum(p[within] * (1 - p[within])))
+        assert within.sum() > 50
+        assert abs(hit[within].sum() - p[within].sum()) < 3 * spread
 
 
 def test_probabilities_are_those_of_bayes_rule_by_integration():
@@ -79,7 +79,7 @@ def test_probabilities_are_those_of_bayes_rule_by_integration():
     log = -0.5 * np.log1p(t2 * square) + 0.5 * t2 * along**2 / (1 + t2 * square)
     weight = np.exp(log).mean(axis=0) / 5
     exact = weight / (1 + weight.sum())
-    assert told(x, y) == pytest.approx(exact, abs=0.03)
+    assert probabilities(x, y) == pytest.approx(exact, abs=0.03)
     assert np.argmax(exact) == 2
 
 
@@ -106,7 +106,7 @@ def test_the_pareto_list_has_what_no_other_one_beats():
 
 @pytest.mark.long
 def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it():
-    d = found()
+    d = discovery()
     readings = d.fit.readings
     w = whitening(readings, d.fit.mode)
     before, after = (
@@ -134,12 +134,12 @@ def test_nothing_is_averaged_without_a_law():
 def products(s, count):
     """Sites and products, of which the model explains neither these nor their factors alone."""
     words = s.grammar
-    seen = s.square > 0
+    visible = s.square > 0
     out = []
     rng = np.random.default_rng(3)
     for f in rng.permutation(np.flatnonzero((words.without_factor >= 0).all(axis=0))).tolist():
         one, two = words.without_factor[:, f].tolist()
-        places = np.flatnonzero(seen[:, f] & seen[:, one] & seen[:, two])
+        places = np.flatnonzero(visible[:, f] & visible[:, one] & visible[:, two])
         if len(places):
             out.append((int(rng.choice(places)), f))
         if len(out) == count:
