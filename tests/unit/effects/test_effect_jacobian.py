@@ -92,9 +92,9 @@ def test_each_effect_with_compliant_joints(name, options, arm):
     model = Model(cell, (*joints, make(name, cell, states, options)))
     theta = random_theta(model.effects, np.random.default_rng(6), 3.0)
     effect = model.effects[-1]
-    own = np.eye(model.size)[-len(effect.parameters) :]
+    directions = np.eye(model.size)[-len(effect.parameters) :]
     yields = type(effect).response is not Effect.response  # and so moves what the joints do
-    assert_slope(model, states, theta, 3, None if yields else own)
+    assert_slope(model, states, theta, 3, None if yields else directions)
 
 
 class Coupled(JointCompliance):
@@ -152,12 +152,12 @@ def test_an_effect_of_many_parameters_moves_the_readings_as_one_of_few():
     names = [p.name for p in many.parameters]
     kept = [names.index(p.name) for p in few.parameters]
     scale = np.random.default_rng(3).uniform(0.5, 2.0, len(names))
-    found = model.jacobian_of((many,), at, theta, 6, scale=scale)
+    jacobian = model.jacobian_of((many,), at, theta, 6, scale=scale)
     expected = model.jacobian_of((few,), at, theta, 6) * scale[kept]
-    np.testing.assert_allclose(found[:, :, kept], expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(jacobian[:, :, kept], expected, rtol=1e-12, atol=1e-14)
     some = np.arange(30, len(names) - 7)
     part = model.jacobian_of((many,), at, theta, 6, some, scale)
-    np.testing.assert_allclose(part, found[:, :, some], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(part, jacobian[:, :, some], rtol=1e-12, atol=1e-14)
 
 
 def test_jacobian_of_an_effect_that_is_not_in_the_model_is_that_at_zero():

@@ -62,8 +62,8 @@ def both(names, cell, states, scale):
     truth = Truth.rigid(cell.arm)
     for name in names:
         # Apart, so that the others are drawn as without it: a gear may not stiffen too much.
-        own = np.random.default_rng(13) if name == "joint_coupling" else rng
-        truth = truth.with_effect(name, truth_of(name, cell, own, scale))
+        draws = np.random.default_rng(13) if name == "joint_coupling" else rng
+        truth = truth.with_effect(name, truth_of(name, cell, draws, scale))
     world = World(cell, truth, cell.registration, np.eye(4), SimulatedNoise(), np.zeros(cell.arm.n))
     model = Model(cell, tuple(make(n, cell, states, options_of(n)) for n in names))
     theta = np.concatenate([true_parameters(world, n) for n in names])
@@ -72,9 +72,9 @@ def both(names, cell, states, scale):
 
 def apart(b, states):
     """Largest distance, m, and angle, rad, of the model's readings from the world's."""
-    seen, told = b.model.predict(states, b.theta).observation, b.world.ideal_readings(states)
-    turn = np.abs(seen.rotation - told.rotation).max()
-    return float(np.linalg.norm(seen.position - told.position, axis=1).max()), float(turn)
+    model, world = b.model.predict(states, b.theta).observation, b.world.ideal_readings(states)
+    turn = np.abs(model.rotation - world.rotation).max()
+    return float(np.linalg.norm(model.position - world.position, axis=1).max()), float(turn)
 
 
 def order_of_turns(b, states):
@@ -299,8 +299,8 @@ def test_couplings_are_expected_a_tenth_as_large_where_the_description_has_none(
 def test_pairs_are_those_of_arms_with_couplings_or_those_that_are_named():
     states = some_states(ODD)
     usual = set(make("joint_coupling", ODD, states).options["pairs"].split("/"))
-    own = {f"{j}:{j}" for j in range(1, 8)}
-    assert usual == {"2:1", "3:2", "4:3", "5:4", "6:5", "7:5", "7:6"} | own
+    diagonal = {f"{j}:{j}" for j in range(1, 8)}
+    assert usual == {"2:1", "3:2", "4:3", "5:4", "6:5", "7:5", "7:6"} | diagonal
     some = make("joint_coupling", ODD, states, {"pairs": "4:4/ 3:2"})
     assert some.options == {"pairs": "3:2/4:4"}
     assert [p.name for p in some.parameters] == ["j3.q2", "j4.q4"]
@@ -352,17 +352,17 @@ def test_a_sensor_that_misreads_is_the_same_as_another_load(name, options):
     states = some_states(cell)
     model = soft(cell, states, name, options)
     theta = ERRORS[name]
-    found = model.predict(states, np.concatenate([joints(cell), theta]))
+    prediction = model.predict(states, np.concatenate([joints(cell), theta]))
     turn = np.array(options.get("rotvec_rad", [0.0, 0.0, 0.0]))
-    other = acting(states.wrench, found.situation.chain.rotation[-1], name, theta, turn)
+    other = acting(states.wrench, prediction.situation.chain.rotation[-1], name, theta, turn)
     plain = Model(cell, model.effects[:1])
     expected = plain.predict(replace(states, wrench=other), joints(cell))
     np.testing.assert_allclose(
-        found.observation.position, expected.observation.position, rtol=0, atol=1e-12
+        prediction.observation.position, expected.observation.position, rtol=0, atol=1e-12
     )
-    np.testing.assert_allclose(found.situation.load.wrench, other, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(prediction.situation.load.wrench, other, rtol=0, atol=1e-10)
     believed = plain.predict(states, joints(cell)).observation.position
-    away = np.linalg.norm(found.observation.position - believed, axis=1)
+    away = np.linalg.norm(prediction.observation.position - believed, axis=1)
     loaded = np.any(states.wrench != 0, axis=1)
     assert away[loaded].min() > 1e-6
     assert away[~loaded].max() == 0.0

@@ -95,9 +95,9 @@ def test_joints_drift_from_where_they_were_at_first():
     kappa = 1e-6 * np.arange(1.0, 7.0)
     for options, reference in (({}, first), ({"reference_degC": 25}, np.full(6, 25.0))):
         effect = make("thermal_joint_drift", UR10E, shuffled, options)
-        found = effect.deviation(kappa, replace(s, states=shuffled)).dq
+        dq = effect.deviation(kappa, replace(s, states=shuffled)).dq
         expected = kappa * (shuffled.joint_temperature - reference)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-18)
+        np.testing.assert_allclose(dq, expected, rtol=0, atol=1e-18)
         kept = make("thermal_joint_drift", UR10E, s.states[5:], effect.options)
         np.testing.assert_allclose(kept.reference, reference, rtol=0, atol=0)
     untimed = replace(shuffled, time=None)
@@ -110,12 +110,12 @@ def test_joints_without_temperatures_warm_up_with_the_time():
     hot, timed = s.states, replace(s.states, joint_temperature=None)
     effect = make("thermal_joint_drift", UR10E, timed)
     kappa = 1e-6 * np.arange(1.0, 7.0)
-    found = effect.deviation(kappa, replace(s, states=timed)).dq
+    dq = effect.deviation(kappa, replace(s, states=timed)).dq
     elapsed = timed.time - timed.time.min()
     rise = 10.0 * (1.0 - np.exp(-elapsed[:, None] / 2400.0))
-    np.testing.assert_allclose(found, kappa * rise, rtol=0, atol=1e-18)
+    np.testing.assert_allclose(dq, kappa * rise, rtol=0, atol=1e-18)
     kept = make("thermal_joint_drift", UR10E, hot[5:], effect.options)  # not by temperatures now
-    np.testing.assert_array_equal(kept.deviation(kappa, s).dq, found)
+    np.testing.assert_array_equal(kept.deviation(kappa, s).dq, dq)
     by_temperature = make("thermal_joint_drift", UR10E, hot)
     for states, options in (
         (timed, by_temperature.options),
@@ -160,12 +160,12 @@ def test_an_effect_is_made_again_from_its_options(name):
     ],
 )
 def test_what_is_typed_is_what_is_read(text, expected):
-    found = read_effects_text(text, "--effects", installed())
-    assert found == expected
-    assert list(found) == list(expected)
+    effects = read_effects_text(text, "--effects", installed())
+    assert effects == expected
+    assert list(effects) == list(expected)
     for name, options in expected.items():
         for key, value in options.items():
-            assert type(found[name][key]) is type(value)
+            assert type(effects[name][key]) is type(value)
 
 
 @refusals("typed_effects")
@@ -190,9 +190,9 @@ values = st.one_of(
                        st.one_of(values, st.lists(values, max_size=3)), max_size=3))  # fmt: skip
 def test_what_is_written_reads_the_same(options):
     text = f"hysteresis, {write_effect('creep', options)}"
-    found = read_effects_text(text, "x", installed())
-    assert found == {"hysteresis": {}, "creep": options}
-    assert repr(found["creep"]) == repr(options)
+    effects = read_effects_text(text, "x", installed())
+    assert effects == {"hysteresis": {}, "creep": options}
+    assert repr(effects["creep"]) == repr(options)
 
 
 @given(st.text(st.sampled_from("creep(joints=1-3,;'\"[]) \n2.e/+"), max_size=30))
@@ -209,9 +209,9 @@ def test_nothing_that_is_typed_fails_otherwise(text):
 def test_options_that_are_not_the_usual_ones_are_told(name, options):
     states = some_states(UR10E)
     effect = make(name, UR10E, states, options)
-    told = chosen_options(effect, states, 3)
+    unusual = chosen_options(effect, states, 3)
     renamed = {"joints" if key == "form" else key: value for key, value in options.items()}
-    assert told == renamed
+    assert unusual == renamed
     assert chosen_options(make(name, UR10E, states), states, 3) == {}
 
 
@@ -289,12 +289,14 @@ def test_a_model_without_readings_takes_effects_that_are_built_only():
 
 def test_what_a_model_could_have_is_what_its_catalogue_holds():
     c = campaign()
-    mine = installed().with_effects(Sag)
-    assert "sag" in baseline(c.cell, c.readings, "absolute", mine).names  # by its role
-    bare = Model(c.cell, (), mine, c.readings) + effect("joint_compliance") + effect("base_frame")
-    found = fit(bare, c.readings, "absolute")
-    assert "sag" in {e.name for e in candidates(found)}
-    refusal("class Sag: effect sag is in the catalogue already", mine.with_effects, Sag)
+    with_sag = installed().with_effects(Sag)
+    assert "sag" in baseline(c.cell, c.readings, "absolute", with_sag).names  # by its role
+    bare = (
+        Model(c.cell, (), with_sag, c.readings) + effect("joint_compliance") + effect("base_frame")
+    )
+    fitted = fit(bare, c.readings, "absolute")
+    assert "sag" in {e.name for e in candidates(fitted)}
+    refusal("class Sag: effect sag is in the catalogue already", with_sag.with_effects, Sag)
 
 
 class Fails(Sag):

@@ -61,17 +61,17 @@ def run_file(table, tmp_path, capsys):
 
 @pytest.mark.long
 def test_it_can_be_fitted_and_added_by_name(run_file, file, capsys):
-    mine = ("--effects-from", file)
+    from_file = ("--effects-from", file)
     chosen = f"joint_compliance,{NAME}"
-    d = ok(capsys, "identify", run_file, "--effects", chosen, *mine, "--json").document
+    d = ok(capsys, "identify", run_file, "--effects", chosen, *from_file, "--json").document
     assert d["model"][-1] == NAME
     units = {p["unit"] for p in d["parameters"] if p["name"].startswith(NAME)}
     assert units == {"rad/(N·m)"}
     ok(capsys, "identify", run_file)
-    a = ok(capsys, "add", run_file, NAME, *mine, "--json").document
+    a = ok(capsys, "add", run_file, NAME, *from_file, "--json").document
     assert a["revisions"][1]["added"] == NAME
     assert "unknown effect" in refused(capsys, 2, "add", run_file, NAME)
-    words = ok(capsys, "compare", run_file, *mine).out
+    words = ok(capsys, "compare", run_file, *from_file).out
     assert NAME in words
 
 
@@ -138,24 +138,24 @@ def hilcal(site, *arguments):
 
 @pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file, file, capsys):
-    mine = ("--effects-from", file)
-    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
+    from_file = ("--effects-from", file)
+    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *from_file)
     for command in (["diagnose"], ["compare"], ["refine", "--from-latest"], ["view"]):
         said = refused(capsys, 2, *command, run_file)
         assert f"revision 1 has the effect {NAME}, which is not in the catalogue" in said
         assert said.endswith(f"--effects-from {file}")
     said = refused(capsys, 2, "validate", run_file, run_file)
     assert NAME in said
-    ok(capsys, "diagnose", run_file, *mine)
+    ok(capsys, "diagnose", run_file, *from_file)
     ok(capsys, "export", run_file, "--parameters", file.with_suffix(".csv"))
 
     changed = file.read_text(encoding="utf-8").replace("np.sin(s.angle)", "np.cos(s.angle)")
     file.write_text(changed, encoding="utf-8")
-    said = refused(capsys, 2, "diagnose", run_file, *mine)
+    said = refused(capsys, 2, "diagnose", run_file, *from_file)
     assert f"was fitted with another {NAME}" in said
     assert str(file) in said
-    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
-    ok(capsys, "diagnose", run_file, *mine)
+    ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *from_file)
+    ok(capsys, "diagnose", run_file, *from_file)
 
 
 def test_nothing_of_it_outlives_a_command(file, capsys):
