@@ -59,19 +59,21 @@ def members(one, seed, odd=0.0, arms=ARMS):
     scaled = one.information * (one.scale[:, None] * one.scale)
     values, vectors = np.linalg.eigh(scaled)
     root = vectors[:, values > 1e-6] / np.sqrt(values[values > 1e-6])
-    found = []
+    campaigns = []
     for a in range(arms):
         factors = compliances(rng)
         if a == ODD:
             factors[2] += odd
         for month in (1, 3):
             noise = one.scale * (root @ rng.normal(size=root.shape[1]))
-            own = replace(one, mean=one.mean * factors + noise)
+            posterior = replace(one, mean=one.mean * factors + noise)
             added = ("creep",) if a == ODD else ()
             date = f"2026-0{month}-01"
             name = f"arm{a}-{month}.hilcal"
-            found.append(Member(name, f"arm{a}", "list", "ur10e", date, own, added, "adequate", 0))
-    return found
+            campaigns.append(
+                Member(name, f"arm{a}", "list", "ur10e", date, posterior, added, "adequate", 0)
+            )
+    return campaigns
 
 
 @pytest.fixture(scope="module")
@@ -81,52 +83,52 @@ def with_odd(one):
 
 
 def test_a_campaign_more_of_an_arm_is_no_arm_more(with_odd):
-    found, _ = with_odd
+    fleet_members, _ = with_odd
     more = SizeEvidence(("creep",), np.array([[0.5]]), np.array([0.4]))
     less = SizeEvidence(("creep",), np.array([[0.2]]), np.array([0.1]))
-    twice = [replace(m, sizes=(more, less)[k % 2]) for k, m in enumerate(found)]
+    twice = [replace(m, sizes=(more, less)[k % 2]) for k, m in enumerate(fleet_members)]
     assert len({m.arm for m in twice[:6]}) == 3
-    told = pool(twice[:6], []).sizes
-    assert told == type_sizes([more] * 3)
-    assert told[0].high < type_sizes([more])[0].high
+    sizes = pool(twice[:6], []).sizes
+    assert sizes == type_sizes([more] * 3)
+    assert sizes[0].high < type_sizes([more])[0].high
 
 
 def test_shrunk_effects_are_pooled_by_what_the_readings_say_of_them(one):
     plain = members(one, 3)[:20]
     shrunk = []
     for m in plain:
-        p, own = m.posterior, (0.5 * one.scale) ** -2.0
-        information = p.information + np.diag(own)
+        p, shrinkage = m.posterior, (0.5 * one.scale) ** -2.0
+        information = p.information + np.diag(shrinkage)
         mean = np.linalg.solve(information, p.information @ p.mean)
-        p = replace(p, information=information, mean=mean, own_precision=own)
+        p = replace(p, information=information, mean=mean, own_precision=shrinkage)
         shrunk.append(replace(m, posterior=p))
     known = [p for p in pool(plain, []).parameters if p.mean_std < 0.1 * p.mean]
-    told = {p.parameter: p for p in pool(shrunk, []).parameters}
+    pooled = {p.parameter: p for p in pool(shrunk, []).parameters}
     assert known
     for p in known:
-        assert told[p.parameter].mean == pytest.approx(p.mean, rel=0.01)
-        assert told[p.parameter].between == pytest.approx(p.between, rel=0.05)
+        assert pooled[p.parameter].mean == pytest.approx(p.mean, rel=0.01)
+        assert pooled[p.parameter].between == pytest.approx(p.between, rel=0.05)
     unnamed = [replace(m, background=frozenset({"joint_compliance"})) for m in shrunk]
     with pytest.raises(CannotAnswerError, match="no parameter"):
         pool(unnamed, [])
 
 
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
-    found = with_odd[1]
-    assert found.parameters
-    for p in found.parameters:
+    pooled = with_odd[1]
+    assert pooled.parameters
+    for p in pooled.parameters:
         mean = one.mean[one.names.index(p.parameter)]
         assert abs(p.mean - mean) < 4.5 * p.mean_std
         assert abs(p.between - SPREAD * abs(mean)) < 4 * p.between_std
-    assert [(o.arm, o.campaign, o.parameter) for o in found.unlike] == [
+    assert [(o.arm, o.campaign, o.parameter) for o in pooled.unlike] == [
         (f"arm{ODD}", "", "joint_compliance.j3")
     ]
-    odd, mean = found.unlike[0], one.mean[one.names.index("joint_compliance.j3")]
+    odd, mean = pooled.unlike[0], one.mean[one.names.index("joint_compliance.j3")]
     assert odd.off == pytest.approx(1.5 * mean, abs=3 * odd.off / odd.sigma)
-    assert [(s.effect, s.kind, s.arms) for s in found.effects_added] == [
+    assert [(s.effect, s.kind, s.arms) for s in pooled.effects_added] == [
         ("creep", "defect", (f"arm{ODD}",))
     ]
-    assert not found.wear
+    assert not pooled.wear
 
 
 @pytest.mark.long
@@ -216,15 +218,15 @@ def test_a_directory_of_campaigns_gives_a_prior_that_identify_takes(capsys, tmp_
     prior, shown = tmp_path / "prior.json", tmp_path / "fleet.html"
     recording = tmp_path / "fleet.rrd"
     options = ("--json", "--workers", "2", "--report", shown, "--record", recording)
-    told = ok(capsys, "fleet", folder, "-o", prior, *options)
-    assert told.document["recording"] == str(recording)
+    outcome = ok(capsys, "fleet", folder, "-o", prior, *options)
+    assert outcome.document["recording"] == str(recording)
     assert recording.stat().st_size > 10_000
     assert "A fleet of arms" in shown.read_text(encoding="utf-8")
-    (of,) = told.document["types"]
+    (of,) = outcome.document["types"]
     assert of["arms"] == ["a", "b", "c"]
-    assert {c["arm_known_by"] for c in told.document["campaigns"]} == {"folder"}
-    assert [f["name"] for f in told.document["failed"]] == ["broken.hilcal"]
-    assert "broken.hilcal: " in told.err
+    assert {c["arm_known_by"] for c in outcome.document["campaigns"]} == {"folder"}
+    assert [f["name"] for f in outcome.document["failed"]] == ["broken.hilcal"]
+    assert "broken.hilcal: " in outcome.err
     new = tmp_path / "fresh.hilcal"
     store(new, readings_of(np.ones(6), 77, poses=4))
     fitted = ok(capsys, "identify", new, "--prior", prior, "--json").document
@@ -283,18 +285,18 @@ def test_campaigns_of_the_same_readings_are_refused(how, capsys, tmp_path):
     else:
         for k in range(25):
             (folder / f"d{k:02d}.hilcal").write_bytes(content)
-    told = refused(capsys, 2, "fleet", folder, "-o", tmp_path / "p.json", "--workers", "1")
-    assert "have readings in common" in told
+    message = refused(capsys, 2, "fleet", folder, "-o", tmp_path / "p.json", "--workers", "1")
+    assert "have readings in common" in message
     first = "d.hilcal" if how == "two extensions" else "b.hilcal"
-    assert first in told or how == "many copies"
+    assert first in message or how == "many copies"
     assert not (tmp_path / "p.json").exists()
 
 
 def fleet(one, odd):
     """30 arms in January and March, of which one may have a soft joint 3."""
-    mine = members(one, 3, odd=odd)
-    of = pool(mine, ())
-    return Fleet((of,), tuple(mine), ()), of
+    campaigns = members(one, 3, odd=odd)
+    of = pool(campaigns, ())
+    return Fleet((of,), tuple(campaigns), ()), of
 
 
 def recorded(drawn, path):
@@ -320,8 +322,8 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
     assert f"arm{ODD} is unlike the others" in words
     drifts = {e for e in entities(path) if e.startswith("/date0/")}
     assert [e for e in drifts if "unlike" in e] == [f"/date0/2/zunlike/{ODD}"]
-    told = [c.to_record_batch() for c in chunks(path, f"/date0/2/zunlike/{ODD}")]
-    assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
+    batches = [c.to_record_batch() for c in chunks(path, f"/date0/2/zunlike/{ODD}")]
+    assert sum(b.num_rows for b in batches if "date" in b.schema.names) == 2
 
 
 def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
@@ -335,35 +337,37 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
 def test_what_others_imitate_only_far_off_is_known():
     """Geometry imitates a joint's compliance, moved by a thousand times its ordinary magnitude."""
     rng = np.random.default_rng(5)
-    own, others = rng.normal(size=(40, 2)), rng.normal(size=(40, 3))
-    others[:, 0] = 1e-3 * (own[:, 0] + 0.1 * own[:, 1])
-    x = np.column_stack([own, others])
-    found = information_on(x.T @ x, np.arange(2))
-    free = own - others[:, 1:] @ np.linalg.lstsq(others[:, 1:], own, rcond=None)[0]
-    np.testing.assert_allclose(found, free.T @ free, rtol=0.01)
-    imitating = np.column_stack([own, 1e3 * others])
-    found = information_on(imitating.T @ imitating, np.arange(2))
-    assert found @ [1.0, 0.1] == pytest.approx(0.0, abs=1e-2)
+    columns, others = rng.normal(size=(40, 2)), rng.normal(size=(40, 3))
+    others[:, 0] = 1e-3 * (columns[:, 0] + 0.1 * columns[:, 1])
+    x = np.column_stack([columns, others])
+    information = information_on(x.T @ x, np.arange(2))
+    free = columns - others[:, 1:] @ np.linalg.lstsq(others[:, 1:], columns, rcond=None)[0]
+    np.testing.assert_allclose(information, free.T @ free, rtol=0.01)
+    imitating = np.column_stack([columns, 1e3 * others])
+    information = information_on(imitating.T @ imitating, np.arange(2))
+    assert information @ [1.0, 0.1] == pytest.approx(0.0, abs=1e-2)
 
 
 @pytest.mark.long
 def test_arms_with_all_their_geometry_have_compliances_near_the_truth():
     """In the fits' over-complete geometry a frame that moves a little moves the compliances."""
-    arms, found, truth = 4, [], []
+    arms, fleet_members, truth = 4, [], []
     for a in range(arms):
         rng = np.random.default_rng(a)
         truth.append(compliances(rng))
         readings = readings_of(truth[-1], a, poses=12)
         start = baseline(cell_of(), readings, "absolute")
         model = with_effects(cell_of(), readings, "absolute", (*start.names, "link_geometry"))
-        own = Posterior.of(fit(model, readings, "absolute"))
+        posterior = Posterior.of(fit(model, readings, "absolute"))
         name, date = f"arm{a}.hilcal", "2026-01-01"
-        found.append(Member(name, f"arm{a}", "list", "ur10e", date, own, (), "adequate", 0))
+        fleet_members.append(
+            Member(name, f"arm{a}", "list", "ur10e", date, posterior, (), "adequate", 0)
+        )
     soft = world_of(cell_of(), np.random.default_rng(7)).physics.joint_compliance
-    pooled = pool(found, ())
-    told = {p.parameter: k for k, p in enumerate(pooled.parameters)}
+    pooled = pool(fleet_members, ())
+    places = {p.parameter: k for k, p in enumerate(pooled.parameters)}
     for j in (1, 2, 3, 4):
-        k = told[f"joint_compliance.j{j + 1}"]
+        k = places[f"joint_compliance.j{j + 1}"]
         off = pooled.off[:, k] + pooled.parameters[k].mean - soft[j] * np.array(truth)[:, j]
         assert np.all(np.abs(off) < 4.5 * pooled.off_std[:, k])
         assert np.all(pooled.off_std[:, k] < 0.2 * soft[j])
