@@ -130,12 +130,12 @@ def drawn(rng, stds, noise, groups, prior=FLAT, *, turned=False):
 
 def test_standard_deviations_are_found_where_the_rows_tell_them():
     rng = np.random.default_rng(4)
-    found = np.array(
+    log_std = np.array(
         [estimate_variances(drawn(rng, (1.0, 0.5), 0.3, 60)[0]).log_std for _ in range(40)]
     )
     true = np.log([1.0, 0.5, 0.3])
-    spread = found.std(axis=0) / np.sqrt(len(found))
-    assert np.all(np.abs(found.mean(axis=0) - true) < 4 * spread + 0.1 * np.array([3, 1, 0]))
+    spread = log_std.std(axis=0) / np.sqrt(len(log_std))
+    assert np.all(np.abs(log_std.mean(axis=0) - true) < 4 * spread + 0.1 * np.array([3, 1, 0]))
     # the family of three is skewed downwards: half a third of a χ² with three degrees of freedom
 
 
@@ -219,13 +219,13 @@ def test_rows_left_out_are_predicted_by_the_others(over):
     at, fold = 0.3 * rng.standard_normal(len(p.priors)), rng.integers(0, 4, len(p.y))
     off, variance = left_out(equations(p, at), fold)
     for f in range(4):
-        mine, others = fold == f, fold != f
+        rows, others = fold == f, fold != f
         noise = tuple(replace(n, variance=n.variance[others]) for n in p.noise)
         e = equations(replace(p, y=p.y[others], x=p.x[others], noise=noise), at)
-        np.testing.assert_allclose(off[mine], p.y[mine] - p.x[mine] @ e.coordinates, rtol=1e-6)
-        own = equations(p, at).noise_std[mine] ** 2
-        spread = np.einsum("ri,ij,rj->r", p.x[mine], e.covariance, p.x[mine])
-        np.testing.assert_allclose(variance[mine], own + spread, rtol=1e-6)
+        np.testing.assert_allclose(off[rows], p.y[rows] - p.x[rows] @ e.coordinates, rtol=1e-6)
+        noise_variance = equations(p, at).noise_std[rows] ** 2
+        spread = np.einsum("ri,ij,rj->r", p.x[rows], e.covariance, p.x[rows])
+        np.testing.assert_allclose(variance[rows], noise_variance + spread, rtol=1e-6)
 
 
 def test_a_family_does_not_stay_small_where_the_iteration_began():
@@ -234,8 +234,8 @@ def test_a_family_does_not_stay_small_where_the_iteration_began():
     usual = estimate_variances(made)
     begun = np.array([-7.0, -7.0, 0.5])
     assert np.abs(equations(made, begun).slope[:2]).max() < 0.1
-    found = estimate_variances(made, begun, search=True)
-    np.testing.assert_allclose(found.log_std, usual.log_std, atol=0.05)
+    variances = estimate_variances(made, begun, search=True)
+    np.testing.assert_allclose(variances.log_std, usual.log_std, atol=0.05)
 
 
 def test_no_size_is_sought_beyond_the_plausible_ones():
@@ -259,17 +259,17 @@ def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal():
     rng = np.random.default_rng(11)
     half = rng.standard_normal((4, 5, 2))  # of a rank below that of the rows
     half[1, 3:] = half[2, :1] = 0.0
-    seen = np.ones((4, 5), dtype=np.bool_)
-    seen[1, 3:] = seen[2, :1] = False
+    observed = np.ones((4, 5), dtype=np.bool_)
+    observed[1, 3:] = observed[2, :1] = False
     covariance = half @ np.swapaxes(half, 1, 2)
-    u, variance = independent_rows(covariance, seen)
+    u, variance = independent_rows(covariance, observed)
     turned = np.swapaxes(u, 1, 2) @ covariance @ u
     expected = np.einsum("gs,st->gst", np.where(variance < -0.5, 0.0, variance), np.eye(5))
     np.testing.assert_allclose(turned, expected, atol=1e-12)
     for g in range(4):  # a row that is not seen is none of a sum of others
         apart = np.abs(u[g][:, variance[g] < -0.5])
         np.testing.assert_allclose(np.sort(apart.max(axis=0, initial=0.0)), 1.0)
-        assert apart[seen[g]].max(initial=0.0) < 1e-12
+        assert apart[observed[g]].max(initial=0.0) < 1e-12
 
 
 def test_compressed_rows_of_white_noise_say_the_same():
