@@ -75,8 +75,8 @@ def test_effects_at_the_equilibrium_give_its_deviation(name):
     p = model.predict(states, theta)
     again = deviation_at(model, p, states, theta)
     for field in ("dq", "twist", "base", "station", "target"):
-        found, expected = getattr(p.deviation, field), getattr(again, field)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        actual, expected = getattr(p.deviation, field), getattr(again, field)
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-12)
     assert p.deviation.scale is None
     largest = np.abs(p.deviation.dq).max()
     assert largest > 1e-3  # the case is worth converging
@@ -116,9 +116,9 @@ def test_elastic_pendulum_hangs_where_its_torques_balance():
 def test_laws_see_the_joints_that_the_encoders_report():
     model, states, theta = case()
     off = 1e-2 * np.random.default_rng(13).normal(size=states.q.shape)
-    told = model.predict(replace(states, q=states.q + 1.0, q_actual=states.q + off), theta)
+    reported = model.predict(replace(states, q=states.q + 1.0, q_actual=states.q + off), theta)
     meant = model.predict(replace(states, q=states.q + off), theta)
-    np.testing.assert_array_equal(told.observation.position, meant.observation.position)
+    np.testing.assert_array_equal(reported.observation.position, meant.observation.position)
 
 
 @pytest.mark.parametrize("times", [3e3, 1e5, 1e8, 1e12])
