@@ -33,24 +33,24 @@ def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0):
     a = rng.normal(size=(rows, flat + len(groups)))
     y = a @ np.concatenate([10 * rng.normal(size=flat), theta]) + noise * rng.normal(size=rows)
     start = np.full(len(groups), 1.0)
-    found = maximise_evidence(a.T @ a, a.T @ y, float(y @ y), rows, flat, groups, start)
-    return found, groups
+    result = maximise_evidence(a.T @ a, a.T @ y, float(y @ y), rows, flat, groups, start)
+    return result, groups
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_strengths_come_out_as_they_are(seed):
     truth = np.array([3.0, 1.0, 0.3])
-    found, groups = linear(truth, 100, seed=seed)
-    told = np.array([found.std[groups == g][0] for g in range(3)])
+    result, groups = linear(truth, 100, seed=seed)
+    strengths = np.array([result.std[groups == g][0] for g in range(3)])
     # A standard deviation from 100 draws is known to 7 %; the iteration stops within 10 % of σ.
-    np.testing.assert_allclose(np.log(told / truth), 0, atol=4 * 0.071 + 0.1)
-    assert found.effective > 250
+    np.testing.assert_allclose(np.log(strengths / truth), 0, atol=4 * 0.071 + 0.1)
+    assert result.effective > 250
 
 
 @pytest.mark.parametrize("noise", [1.0, 3.0, 10.0])
 def test_the_noise_factor_is_found_but_never_below_the_stated_one(noise):
-    found, _ = linear([5.0], 50, noise=noise)
-    assert found.beta == pytest.approx(noise**2, rel=4 * np.sqrt(2 / 1147))
+    result, _ = linear([5.0], 50, noise=noise)
+    assert result.beta == pytest.approx(noise**2, rel=4 * np.sqrt(2 / 1147))
     quiet, _ = linear([5.0], 50, noise=0.1)
     assert quiet.beta == 1.0
 
@@ -66,27 +66,27 @@ def with_harmonics(effect, seed, hidden, **options):
     return fit(model, c.readings, "absolute"), truth
 
 
-def amplitudes(found):
-    return found.theta[found.model.slices()[-1]].reshape(6, 6, 2)
+def amplitudes(fitted):
+    return fitted.theta[fitted.model.slices()[-1]].reshape(6, 6, 2)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_harmonics_that_are_there_are_kept_and_absent_ones_are_not(seed):
-    found, truth = with_harmonics("transmission_error", seed, 2, strength=6.0)
-    told = amplitudes(found)
+    fitted, truth = with_harmonics("transmission_error", seed, 2, strength=6.0)
+    estimates = amplitudes(fitted)
     present = np.linalg.norm(truth, axis=2) > 0
     # The first joint's first harmonic and the base, the last joint's and the target, are partly
     # the same; all others are told apart.
     large = np.linalg.norm(truth, axis=2) > 3e-5
     large[[0, 5]] = False
     assert large.sum() >= 4
-    off = np.linalg.norm(told - truth, axis=2)
+    off = np.linalg.norm(estimates - truth, axis=2)
     assert np.all(off[large] < 0.5 * np.linalg.norm(truth, axis=2)[large])
-    size = np.linalg.norm(told, axis=2)
+    size = np.linalg.norm(estimates, axis=2)
     assert np.sqrt(np.mean(size[~present] ** 2)) < 0.15 * np.sqrt(np.mean(size[present] ** 2))
-    prior = found.solution.prior[found.model.slices()[-1]].reshape(6, 6, 2)
+    prior = fitted.solution.prior[fitted.model.slices()[-1]].reshape(6, 6, 2)
     assert np.mean(prior[~present] == 0) > 0.4
-    low, high = found.variance_factor_interval
+    low, high = fitted.variance_factor_interval
     assert low < 1.1
     assert high > 0.9
 
@@ -95,14 +95,14 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
     """On poses that were never there."""
     worse, effective, determined = [], [], []
     for seed in range(5):
-        found, _ = with_harmonics("none", seed, 6)
+        fitted, _ = with_harmonics("none", seed, 6)
         c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
         plain = fitted_model(c.cell, c.readings, "absolute")
         new = measured(c.world, plan(40, 77), np.random.default_rng(seed + 100))
-        off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (found, plain)]
+        off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (fitted, plain)]
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)
-        effective.append(found.solution.effective - plain.solution.effective)
-        s = found.solution
+        effective.append(fitted.solution.effective - plain.solution.effective)
+        s = fitted.solution
         determined.append(
             effective_parameters(s.equations, s.beta, s.equations.inverse_root(s.beta))
             - plain.solution.effective
@@ -114,12 +114,12 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
 
 
 def test_a_dropped_harmonic_is_not_counted_nor_listed():
-    found, _ = with_harmonics("none", 0, 6)
+    fitted, _ = with_harmonics("none", 0, 6)
 
-    prior = found.solution.prior[found.model.slices()[-1]]
-    listed = [p for p in found.parameters if p.name.startswith("transmission_error")]
+    prior = fitted.solution.prior[fitted.model.slices()[-1]]
+    listed = [p for p in fitted.parameters if p.name.startswith("transmission_error")]
     assert len(listed) == np.count_nonzero(prior)
-    assert np.all(found.theta[found.model.slices()[-1]][prior == 0] == 0)
+    assert np.all(fitted.theta[fitted.model.slices()[-1]][prior == 0] == 0)
 
 
 def test_the_variance_is_right_where_the_data_choose_which_groups_to_keep():
@@ -130,11 +130,11 @@ def test_the_variance_is_right_where_the_data_choose_which_groups_to_keep():
         a = rng.normal(size=(rows, 240))
         truth = np.where(groups < 40, 1.0, 0.0) * rng.normal(size=240)
         y = a @ truth + rng.normal(size=rows)
-        found = maximise_evidence(a.T @ a, a.T @ y, y @ y, rows, 0, groups, np.ones(240))
-        live = found.std > 0
-        h = a[:, live].T @ a[:, live] + np.diag(found.beta / found.std[live] ** 2)
+        result = maximise_evidence(a.T @ a, a.T @ y, y @ y, rows, 0, groups, np.ones(240))
+        live = result.std > 0
+        h = a[:, live].T @ a[:, live] + np.diag(result.beta / result.std[live] ** 2)
         theta = np.linalg.solve(h, a[:, live].T @ y)
-        determined = 1 - found.beta * np.diag(np.linalg.inv(h)) / found.std[live] ** 2
+        determined = 1 - result.beta * np.diag(np.linalg.inv(h)) / result.std[live] ** 2
         share = np.bincount(groups[live], weights=determined, minlength=120) / 2
         kept = share > 0
         rss = np.sum((y - a[:, live] @ theta) ** 2)
@@ -159,10 +159,10 @@ def errors(seed):
 
     def fitted(rows, target):
         gram, rhs = rows.T @ rows, rows.T @ target
-        found = maximise_evidence(
+        result = maximise_evidence(
             gram, rhs, float(target @ target), len(rows), FLAT, group, np.full(len(group), 0.1)
         )
-        return found.std, rhs, found.beta
+        return result.std, rhs, result.beta
 
     std, _, beta = fitted(a, y)
     problem = FamilyProblem(a, y, np.zeros((FLAT, FLAT)), np.zeros(FLAT), group, std, beta)
@@ -187,8 +187,8 @@ def errors(seed):
 
 
 def test_folds_promise_the_error_on_rows_that_were_never_there():
-    found = np.array([errors(seed) for seed in range(20)])
-    honest, fixed = found[:, 2] / found[:, 0], found[:, 2] / found[:, 1]
+    rms = np.array([errors(seed) for seed in range(20)])
+    honest, fixed = rms[:, 2] / rms[:, 0], rms[:, 2] / rms[:, 1]
     # A fold has nine tenths of the rows, so that it promises a little too much error.
     assert 0.93 < np.mean(honest) < 1.03
     assert np.mean(fixed) > 1.1

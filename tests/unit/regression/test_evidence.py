@@ -51,28 +51,28 @@ def with_priors(family=4, noise=1.0):
 
 def test_it_is_the_ratio_of_marginal_likelihoods_where_that_is_largest():
     of = with_priors()
-    found = score(of)
+    result = score(of)
     rss = float(of.y @ of.dense @ of.y)
     size = of.x.shape[1]
     ratios = [
         marginal(of, np.full(size, tau**2 * DOF / rss)) - marginal(of, np.zeros(size))
         for tau in STRENGTHS
     ]
-    assert found.log_evidence == pytest.approx(max(ratios), rel=1e-10)
-    assert found.log_evidence > 5
-    assert found.strength == STRENGTHS[int(np.argmax(ratios))]
-    assert found.ridge == pytest.approx(rss / (DOF * found.strength**2), rel=1e-12)
+    assert result.log_evidence == pytest.approx(max(ratios), rel=1e-10)
+    assert result.log_evidence > 5
+    assert result.strength == STRENGTHS[int(np.argmax(ratios))]
+    assert result.ridge == pytest.approx(rss / (DOF * result.strength**2), rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["flat", "priors", "no columns"])
 def test_posterior_mean_and_scale_are_those_of_ridge_regression(kind):
     of = problem(kind)
-    found = score(of)
-    h = of.x.T @ of.dense @ of.x + found.ridge * np.eye(of.x.shape[1])
+    result = score(of)
+    h = of.x.T @ of.dense @ of.x + result.ridge * np.eye(of.x.shape[1])
     mean = np.linalg.solve(h, of.x.T @ of.dense @ of.y)
-    np.testing.assert_allclose(found.step, mean, rtol=1e-10)
+    np.testing.assert_allclose(result.step, mean, rtol=1e-10)
     left = float(of.y @ of.dense @ (of.y - of.x @ mean)) / DOF
-    np.testing.assert_allclose(found.root @ found.root.T, left * np.linalg.inv(h), rtol=1e-9)
+    np.testing.assert_allclose(result.root @ result.root.T, left * np.linalg.inv(h), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -157,8 +157,8 @@ def test_equal_eigenvalues_are_a_beta_law(k, dimension, level):
     """A saddlepoint approximation is right to a few per cent of the tail, here checked to 5 %."""
     for p in (0.9, 0.5, 0.1, 1e-2, 1e-4, 1e-8, 1e-14):
         c = level * float(beta.isf(p, k / 2, (dimension - k) / 2))
-        told = ratio_tail(np.full(k, level), dimension, c)
-        assert told == pytest.approx(exact(k, dimension, level, c), rel=0.05)
+        tail = ratio_tail(np.full(k, level), dimension, c)
+        assert tail == pytest.approx(exact(k, dimension, level, c), rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -229,11 +229,11 @@ TRIED = np.logspace(-2, 3, 21)
 ROWS, MODEL, BLOCKS, WIDTH, FOLDS = 400, 12, 15, 4, 5
 
 
-def chosen_by_columns(own, ridge, flat, x, y, most, least):
+def chosen_by_columns(model, ridge, flat, x, y, most, least):
     """Whiten all columns by the covariance of the random part, and project them off the flat."""
-    random = own[:, flat:] / np.sqrt(ridge[flat:])
+    random = model[:, flat:] / np.sqrt(ridge[flat:])
     root = np.linalg.cholesky(np.eye(len(y)) + random @ random.T)
-    b = np.linalg.qr(np.linalg.solve(root, own[:, :flat]))[0]
+    b = np.linalg.qr(np.linalg.solve(root, model[:, :flat]))[0]
     blocks = np.linalg.solve(root, x.reshape(len(y), -1)).reshape(x.shape)
     r, dof = np.linalg.solve(root, y), len(y) - flat
     blocks, r = (
@@ -260,17 +260,17 @@ def test_the_same_blocks_in_the_same_order():
     lengths = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        own, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
+        model, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
         x[:, 3] = x[:, 2] + 0.1 * x[:, 3]  # nearly the same block
-        x[:, 5, 0] = own[:, 1]  # a column of the model
+        x[:, 5, 0] = model[:, 1]  # a column of the model
         ridge = np.where(np.arange(MODEL) < 6, 1e-6, 50.0)
         y = x[:, 2] @ rng.normal(size=WIDTH) + x[:, 7, 0] + x[:, 9, 1] + rng.normal(size=ROWS)
-        y += own @ rng.normal(size=MODEL)
+        y += model @ rng.normal(size=MODEL)
         fold = rng.integers(0, FOLDS, ROWS)
-        selection = BlockSelection(own, ridge, x, y, fold, 6)
+        selection = BlockSelection(model, ridge, x, y, fold, 6)
         for f in range(FOLDS):
             rest = fold != f
-            expected = chosen_by_columns(own[rest], ridge, 6, x[rest], y[rest], 4, 8.0)
+            expected = chosen_by_columns(model[rest], ridge, 6, x[rest], y[rest], 4, 8.0)
             assert selection.without(f, 4, 8.0, TRIED) == expected
             lengths.append(len(expected))
     assert min(lengths) >= 3
@@ -278,17 +278,17 @@ def test_the_same_blocks_in_the_same_order():
 
 def test_nothing_is_chosen_of_noise():
     rng = np.random.default_rng(1)
-    own, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
+    model, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
     y, fold = rng.normal(size=ROWS), np.arange(ROWS) % FOLDS
-    selection = BlockSelection(own, np.full(MODEL, 1e-6), x, y, fold, MODEL)
+    selection = BlockSelection(model, np.full(MODEL, 1e-6), x, y, fold, MODEL)
     assert [selection.without(f, 4, 8.0, TRIED) for f in range(FOLDS)] == [[]] * FOLDS
 
 
 def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing():
     """As one pose read 12,000 times beside others: a sample of the rows misses whole poses."""
     rng = np.random.default_rng(0)
-    own, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 3, 2))
+    model, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 3, 2))
     y = x[:, 1, 0] + 0.1 * rng.normal(size=60)
-    first = BlockSelection(own, np.ones(2), x, y, np.arange(60) % 3, 0)
+    first = BlockSelection(model, np.ones(2), x, y, np.arange(60) % 3, 0)
     strengths = np.array([0.1, 1.0])
     assert first.without(3, 2, 3.0, strengths) == first.without(7, 2, 3.0, strengths) == [1]

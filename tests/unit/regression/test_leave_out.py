@@ -44,7 +44,7 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
     each, p, basis, white, _ = model(beta)
     fold, ridge, family = np.arange(60) % 5, 0.8, FamilyFolds(each, x)
     before = each.left_out(white, of_fit=True)
-    found, alone = family.left_out(before, ridge), before.residual
+    predicted, alone = family.left_out(before, ridge), before.residual
     information = p.schur(family.gram, family.cross)
     np.testing.assert_allclose(information, p.information(x), rtol=1e-11, atol=1e-12)
     # Without a fold the flat parameters have a prior, too.
@@ -53,7 +53,7 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
         out = fold == f
         whole = np.hstack([a, x])
         both = refit(whole[~out], y[~out], np.append(std, np.full(2, np.sqrt(beta / ridge))), beta)
-        np.testing.assert_allclose(found[out], y[out] - whole[out] @ both, atol=1e-4)
+        np.testing.assert_allclose(predicted[out], y[out] - whole[out] @ both, atol=1e-4)
         bare = refit(a[~out], y[~out], std, beta)
         np.testing.assert_allclose(alone[out], y[out] - a[out] @ bare, atol=1e-4)
         step = basis.transform @ each.folds[f].step()
@@ -64,17 +64,17 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
 def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge):
     each, p, _, _, x = model(1.0)
     y = np.random.default_rng(6).standard_normal((60, 3))
-    found, before = FamilyFolds(each, x), each.left_out(y)
+    family, before = FamilyFolds(each, x), each.left_out(y)
     for again in (ridge, 2.0, ridge):  # another ridge in between changes nothing
-        left = found.left_out(before, again)
+        left = family.left_out(before, again)
     alone = before.residual
     for fold in each.folds:
         rows, stay = p.rows[fold.left_out_rows], ~fold.left_out_rows
         h = np.linalg.inv(fold.inverse_root.T @ fold.inverse_root)
         cross = p.rows[stay].T @ x[stay]
-        own = x[stay].T @ x[stay] + ridge * np.eye(2)
+        block = x[stay].T @ x[stay] + ridge * np.eye(2)
         rhs = np.vstack([p.rows[stay].T @ y[stay], x[stay].T @ y[stay]])
-        step = np.linalg.solve(np.block([[h, cross], [cross.T, own]]), rhs)
+        step = np.linalg.solve(np.block([[h, cross], [cross.T, block]]), rhs)
         expected = y[fold.left_out_rows] - np.hstack([rows, x[fold.left_out_rows]]) @ step
         np.testing.assert_allclose(left[fold.left_out_rows], expected, atol=1e-8)
         plain = y[fold.left_out_rows] - rows @ np.linalg.solve(h, p.rows[stay].T @ y[stay])
@@ -85,12 +85,12 @@ def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge
 def test_a_model_without_columns_is_as_a_refit_without_them(out):
     beta = 1.7
     a, _, y, theta = case(beta)
-    mine = np.isin(np.arange(6), out)
-    reduced = eliminate_columns(a, a.T @ a, y - a @ theta, theta, PRIOR, mine, beta, 60)
-    again = refit(a[:, ~mine], y, PRIOR[~mine], beta)
-    np.testing.assert_allclose(reduced.residual, y - a[:, ~mine] @ again, atol=1e-11)
-    h = a[:, ~mine].T @ a[:, ~mine] + np.diag(beta / PRIOR[~mine] ** 2)
-    spent = np.trace(np.linalg.solve(h, a[:, ~mine].T @ a[:, ~mine]))
+    removed = np.isin(np.arange(6), out)
+    reduced = eliminate_columns(a, a.T @ a, y - a @ theta, theta, PRIOR, removed, beta, 60)
+    again = refit(a[:, ~removed], y, PRIOR[~removed], beta)
+    np.testing.assert_allclose(reduced.residual, y - a[:, ~removed] @ again, atol=1e-11)
+    h = a[:, ~removed].T @ a[:, ~removed] + np.diag(beta / PRIOR[~removed] ** 2)
+    spent = np.trace(np.linalg.solve(h, a[:, ~removed].T @ a[:, ~removed]))
     assert reduced.dof == pytest.approx(60 - spent, rel=1e-12)
-    s = mine.sum()
+    s = removed.sum()
     assert reduced.score().rank == s

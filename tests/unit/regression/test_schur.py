@@ -59,9 +59,9 @@ def test_units_of_the_parameters_do_not_matter(singular):
 
 def test_many_matrices_at_once():
     m = np.stack([c.T @ c for c in (columns(singular=False), columns(singular=True))] * 2)
-    found = schur_complement(m.reshape(2, 2, 8, 8), INTEREST)
+    stacked = schur_complement(m.reshape(2, 2, 8, 8), INTEREST)
     each = [schur_complement(one, INTEREST) for one in m]
-    np.testing.assert_allclose(found.reshape(4, 3, 3), each, rtol=1e-13)
+    np.testing.assert_allclose(stacked.reshape(4, 3, 3), each, rtol=1e-13)
 
 
 @pytest.mark.parametrize("singular", [False, True])
@@ -148,16 +148,18 @@ def test_products_are_those_of_the_dense_matrix(kind):
 def test_the_residual_does_not_depend_on_where_the_model_stands(kind, off):
     of = problem(kind)
     z = of.estimate + off
-    found = of.projection.residual(of.y - of.rows @ z, z)
-    np.testing.assert_allclose(found, of.dense @ of.y, atol=1e-12)
+    residual = of.projection.residual(of.y - of.rows @ z, z)
+    np.testing.assert_allclose(residual, of.dense @ of.y, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_columns_that_depend_on_each_other_count_once(scale):
     rng = np.random.default_rng(0)
-    own, y = rng.standard_normal((30, 3)), rng.standard_normal(30)
-    double = scale * np.hstack([own, own @ rng.standard_normal((3, 2)), np.zeros((30, 1))])
-    p, q = projection(double, np.zeros(6)), np.linalg.qr(own)[0]
+    independent, y = rng.standard_normal((30, 3)), rng.standard_normal(30)
+    double = scale * np.hstack(
+        [independent, independent @ rng.standard_normal((3, 2)), np.zeros((30, 1))]
+    )
+    p, q = projection(double, np.zeros(6)), np.linalg.qr(independent)[0]
     np.testing.assert_allclose(p.project_out(y), y - q @ (q.T @ y), atol=1e-10)
     assert np.count_nonzero(np.any(p.inverse_root, axis=1)) == 3
 

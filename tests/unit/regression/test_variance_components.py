@@ -29,11 +29,11 @@ def test_the_balanced_layout_has_a_closed_form(between):
     b = one_way(30, 4, between, 3)
     means = 2.0 * b.y.mean(axis=1)
     closed = max((float(np.var(means, ddof=1)) - 1.0) / 4.0, 0.0)
-    found = variance_components([b], np.zeros(1))
-    assert found.variance[0] == pytest.approx(closed, rel=2e-3, abs=1e-6)
+    estimate = variance_components([b], np.zeros(1))
+    assert estimate.variance[0] == pytest.approx(closed, rel=2e-3, abs=1e-6)
     if closed > 0:
         std = np.sqrt(2 / 29) * (1 + 4 * closed) / 4
-        assert np.sqrt(found.covariance[0, 0]) == pytest.approx(std, rel=0.02)
+        assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(std, rel=0.02)
 
 
 def dense(b, ridge, s):
@@ -71,10 +71,10 @@ def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihoo
     rows = np.concatenate([b.rows.reshape(-1, 3) for b in parts])[None]
     whole = BlockRows(y, rows, k)
     best = minimize_scalar(lambda s: -dense(whole, ridge, s), bounds=(0, 50), method="bounded")
-    found = variance_components(parts, ridge)
-    assert found.variance[0] == pytest.approx(best.x, rel=0.02)
+    estimate = variance_components(parts, ridge)
+    assert estimate.variance[0] == pytest.approx(best.x, rel=0.02)
     gain = dense(whole, ridge, float(best.x)) - dense(whole, ridge, 0.0)
-    assert found.log_likelihood == pytest.approx(gain, abs=2e-3)
+    assert estimate.log_likelihood == pytest.approx(gain, abs=2e-3)
 
 
 def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_right():
@@ -85,8 +85,8 @@ def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_rig
     for _ in range(60):
         y = rng.standard_normal((40, 3))
         y += np.einsum("cgi,c,cg->gi", vectors, np.sqrt(truth), rng.standard_normal((2, 40)))
-        found = variance_components([BlockRows(y, rows, components)], np.zeros(30))
-        z.append(found.variance)
+        estimate = variance_components([BlockRows(y, rows, components)], np.zeros(30))
+        z.append(estimate.variance)
     mean, error = np.mean(z, axis=0), np.std(z, axis=0) / np.sqrt(60)
     assert np.all(np.abs(mean - truth) < 4 * error)
 
@@ -96,8 +96,8 @@ def test_the_scale_of_a_component_does_not_matter(scale):
     b = one_way(30, 4, 2.0, 5)
     whole = variance_components([b], np.zeros(1))
     scaled = BlockRows(b.y, b.rows, scale * b.components)
-    found = variance_components([scaled], np.zeros(1))
-    assert scale * found.variance[0] == pytest.approx(whole.variance[0], rel=1e-3)
+    estimate = variance_components([scaled], np.zeros(1))
+    assert scale * estimate.variance[0] == pytest.approx(whole.variance[0], rel=1e-3)
 
 
 ARMS, TIMES, SIZE = 30, 2, 6
