@@ -40,14 +40,14 @@ def readings(folder, hide, seed):
 def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path, hide):
     config, measured = readings(tmp_path, hide, 3)
     cell, nominal = cell_from_config(config, tmp_path), load_arm("ur15")
-    found = check_factory(cell, nominal, cell.factory, measured)
-    assert found.changed == (hide != "nothing")
-    assert found.readings == len(measured)
-    assert found.nominal_m > 2.0 * found.factory_m  # the arm is the factory's, not the maker's
+    check = check_factory(cell, nominal, cell.factory, measured)
+    assert check.changed == (hide != "nothing")
+    assert check.readings == len(measured)
+    assert check.nominal_m > 2.0 * check.factory_m  # the arm is the factory's, not the maker's
     if hide == "nothing":
-        assert found.moved_m < 3.0 * found.moved_std_m < 1e-4
+        assert check.moved_m < 3.0 * check.moved_std_m < 1e-4
         other = check_factory(cell, nominal, factory_of("ur15", seed=8), measured)
         assert other.changed  # somebody else's file
-        assert other.factory_m > found.factory_m
+        assert other.factory_m > check.factory_m
     else:
-        assert found.moved_m > 3.0 * found.moved_std_m
+        assert check.moved_m > 3.0 * check.moved_std_m

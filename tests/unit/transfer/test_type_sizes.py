@@ -53,12 +53,12 @@ def at_nominal(cell, of):
 
 def sizes_told(ordinary):
     """Sizes by five arms of a type, whose cell states `ordinary`."""
-    cell, told = cell_of(ordinary), []
+    cell, evidence = cell_of(ordinary), []
     for arm in range(5):
         readings = measured(cell, 30, np.random.default_rng([arm, 7]))
-        found = mixed_fit(baseline(cell, readings, "absolute"), readings, "absolute")
-        told.append(evidence_of(found.variances, ordinary))
-    return type_sizes(told)
+        mixed = mixed_fit(baseline(cell, readings, "absolute"), readings, "absolute")
+        evidence.append(evidence_of(mixed.variances, ordinary))
+    return type_sizes(evidence)
 
 
 @pytest.fixture(scope="module")
