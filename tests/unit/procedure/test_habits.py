@@ -42,13 +42,13 @@ def two_targets():
 )
 def test_the_error_falls(config, poses, readings, tmp_path):
     d = drawn_calibration(tmp_path / "run.hilcal", config=config, poses=poses, readings=readings)
-    found = d.to_the_end()
-    error = found.everything
+    improvement = d.to_the_end()
+    error = improvement.everything
     assert error.count == 5
     assert error.before.rms_m > 8 * error.after.rms_m
     assert error.inside >= 3
-    assert found.mode == readings
-    assert ({"none"} == set(found.loads)) == (config.loads == ())
+    assert improvement.mode == readings
+    assert ({"none"} == set(improvement.loads)) == (config.loads == ())
 
 
 @pytest.mark.long
@@ -65,11 +65,11 @@ def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path):
     crate = Obstacle(name="crate", center_m=(x, y, z), size_m=(0.1, 0.1, 0.1))
     config = d.procedure.config.model_copy(update={"obstacles": (crate,)})
     d = replace(d, procedure=replace(d.procedure, cell=d.procedure.cell.with_config(config)))
-    found = d.to_the_end()
-    left = dict(found.left_out)
+    improvement = d.to_the_end()
+    left = dict(improvement.left_out)
     assert "v1" in {name.split(" ")[0] for name in left}
     assert all("[[obstacles]]" in why or "no clear motion" in why for why in left.values())
-    assert found.everything.count == 5 - len(left) > 0
+    assert improvement.everything.count == 5 - len(left) > 0
 
 
 @pytest.mark.slow

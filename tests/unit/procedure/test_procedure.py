@@ -46,17 +46,17 @@ ALL = [*FIRST, "plan_validation", "measure_validation", *LAST]
 def done(tmp_path_factory):
     """A calibration that was stopped after each step, and in each measurement."""
     d = drawn_calibration(tmp_path_factory.mktemp("run") / "run.hilcal", validation=6)
-    found = None
+    improvement = None
     while (step := d.procedure.next()).kind != "done":
         if step.moves and step.missing > 2:
             d.dies_after = step.missing - 2
             with pytest.raises(KilledError):
                 d.do(step)
         else:
-            found = d.do(step)
+            improvement = d.do(step)
         d = reopened(d)
-    assert isinstance(found, Improvement)
-    return d, found
+    assert isinstance(improvement, Improvement)
+    return d, improvement
 
 
 def test_it_goes_on_after_any_stop(done):
@@ -79,10 +79,10 @@ def test_time_goes_on_in_the_next_campaign_though_the_clock_was_set(tmp_path, se
     """By an hour between two sessions, and by `set_back` before the next campaign."""
     p = drawn_calibration(tmp_path / "run.hilcal", config=small_config(1), poses=4).procedure
     p.begin(p.plan().plan, p.config)
-    now, clock, told = time.time(), p.clock, []
+    now, clock, epochs = time.time(), p.clock, []
 
     def measure(campaign, epoch):
-        told.append(epoch)
+        epochs.append(epoch)
         log = RunLog(campaign)
         for k, step in enumerate(log.plan.steps):
             wall = now + set_back + 10.0 * k - 3600.0 * (k > 2)
@@ -93,11 +93,11 @@ def test_time_goes_on_in_the_next_campaign_though_the_clock_was_set(tmp_path, se
     step = p.next()
     count = p.measure(step, measure)
     shutil.copy(p.run, p.files.validation)
-    p.measure(replace(step, path=p.files.validation), lambda _, epoch: told.append(epoch))
+    p.measure(replace(step, path=p.files.validation), lambda _, epoch: epochs.append(epoch))
     last = 200.0 * (count - 1)
-    elapsed = (time.time() - told[1]) * clock
+    elapsed = (time.time() - epochs[1]) * clock
     pause = clock * max(3600.0 - set_back - 10.0 * (count - 1), 0.0)
-    assert told[0] is None
+    assert epochs[0] is None
     assert elapsed == pytest.approx(last + pause, abs=60.0 * clock)
     assert elapsed >= last
 
@@ -130,40 +130,40 @@ def test_a_pose_that_cannot_be_measured_does_not_lock_it(tmp_path):
                 log.skip([pose])
             skipped.append((step.path, pose))
         else:
-            found = d.do(step)
+            improvement = d.do(step)
     assert [path for path, _ in skipped] == [files.run, files.validation, files.corrected]
     (_, validated), (_, corrected) = skipped[1:]
-    assert found.everything.count == 4
-    assert corrected in dict(found.left_out)
+    assert improvement.everything.count == 4
+    assert corrected in dict(improvement.left_out)
     assert validated not in corrected
 
 
 def test_the_error_falls_as_far_as_predicted(done):
-    _, found = done
-    every = found.everything
+    _, improvement = done
+    every = improvement.everything
     assert every.count == 6
     assert every.before.rms_m > 10 * every.after.rms_m
     assert every.removed > 0.9
     assert every.inside >= 4
-    assert sum(part.count for part in found.by_load) == 6
-    assert found.left_out == ()
+    assert sum(part.count for part in improvement.by_load) == 6
+    assert improvement.left_out == ()
 
 
 @pytest.mark.long
 def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_path, capsys):
-    """Alone "94 % are removed" would be said, beside bands that none of its points keeps."""
+    """Otherwise "94 % are removed" would be said, although no point lies within its band."""
     d = drawn_calibration(
         tmp_path / "run.hilcal", poses=12, validation=6, readings="absolute",
         config=small_config(readings="absolute"),
     )  # fmt: skip
     while (step := d.procedure.next()).kind != "done":
         d.hidden = "nothing" if step.path == d.procedure.run else "encoder_offset"
-        found = d.do(step)
+        result = d.do(step)
         if step.kind == "validate":
-            assert "times as far off as the fit states" in "".join(validation_lines(found))
-    assert found.refuted
-    assert REFUTED in list(improvement_report(found, None))
-    limit = 0.9 * float(found.after_m.max())
+            assert "times as far off as the fit states" in "".join(validation_lines(result))
+    assert result.refuted
+    assert REFUTED in list(improvement_report(result, None))
+    limit = 0.9 * float(result.after_m.max())
     with Campaign.open(d.procedure.run) as run:
         words, passed = limit_words(content_of(run, ReportOptions(limit_m=limit)))
         q = ",".join(map(str, run.readings.states.q[0]))
@@ -172,7 +172,7 @@ def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_pa
     points = tmp_path / "points.csv"
     points.write_text(f"pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\na,{q}\n")
     warned = ok(capsys, "compensate", d.procedure.run, points).err
-    every, arm = found.everything, tmp_path / "arm.json"
+    every, arm = result.everything, tmp_path / "arm.json"
     words = f"{every.inside} of {every.count} points that"
     assert f"warning: {d.procedure.run}: {words}" in warned
     exported = ok(capsys, "export", d.procedure.run, "--calibration", arm)
@@ -205,10 +205,10 @@ def test_an_arm_without_temperatures_in_its_validation_does_not_lock_it(tmp_path
 
     monkeypatch.setattr(RunLog, "record", cold)
     while (step := d.procedure.next()).kind != "done":
-        found = d.do(step)
+        result = d.do(step)
         if step.kind == "refine":
-            assert "thermal_joint_drift" in found.fit.model.names
-    assert found.everything.count == 6
+            assert "thermal_joint_drift" in result.fit.model.names
+    assert result.everything.count == 6
 
 
 def test_validation_poses_lie_within_what_was_measured_and_are_new(done):
@@ -219,8 +219,8 @@ def test_validation_poses_lie_within_what_was_measured_and_are_new(done):
     slack = 0.02 * np.ptp(q, axis=0)
     assert (new >= q.min(axis=0) - slack).all()
     assert (new <= q.max(axis=0) + slack).all()
-    own = np.array([unseen.pose_names[k] != REFERENCE for k in unseen.pose])
-    apart = np.abs(new[own][:, None] - q[None]).max(axis=2)
+    of_validation = np.array([unseen.pose_names[k] != REFERENCE for k in unseen.pose])
+    apart = np.abs(new[of_validation][:, None] - q[None]).max(axis=2)
     assert apart.min() > 0.01
     assert not found_among(unseen, fitted).any()
 
@@ -249,8 +249,8 @@ def test_a_validation_campaign_is_frozen(done):
         assert purpose_of(test) == "validation"
     with hc.Campaign.open(files.validation) as o:
         refusal(r"a validation campaign of run\.hilcal", o.fit_in_use)
-        found = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
-        refusal("never fitted", o.append, found)
+        fitted = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
+        refusal("never fitted", o.append, fitted)
         assert o.latest() is None
 
 
@@ -281,11 +281,11 @@ def test_another_validation_campaign_is_refused(done):
 
 def until_decided(d):
     """Do the steps before the validation; returns their kinds, and what the last one gave."""
-    kinds, found = [], None
+    kinds, result = [], None
     while (step := d.procedure.next()).kind != "plan_validation":
-        found = d.do(step)
+        result = d.do(step)
         kinds.append(step.kind)
-    return kinds, found
+    return kinds, result
 
 
 def with_goal(d, goal_m):
@@ -296,10 +296,10 @@ def with_goal(d, goal_m):
 @pytest.mark.long
 def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is(tmp_path):
     d = drawn_calibration(tmp_path / "run.hilcal", goal_m=5e-6)
-    kinds, found = until_decided(d)
+    kinds, decision = until_decided(d)
     assert kinds == FIRST
-    assert found.reason == "floor"
-    assert found.error.floor_m > 5e-6
+    assert decision.reason == "floor"
+    assert decision.error.floor_m > 5e-6
     d = with_goal(d, 1.0)
     with CampaignFile.open(d.procedure.run) as run:
         d.procedure.resume(run)
@@ -320,9 +320,9 @@ def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path):
     )
     assert isinstance(d.to_the_end(), Improvement)
     with CampaignFile.open(d.procedure.run) as campaign:
-        found = ProcedureLog(campaign).last(DECIDED)
-    assert found["reason"] == "goal_met"
-    assert 0 < found["floor_m"] < found["predicted_m"] < 1e-3
+        decision = ProcedureLog(campaign).last(DECIDED)
+    assert decision["reason"] == "goal_met"
+    assert 0 < decision["floor_m"] < decision["predicted_m"] < 1e-3
 
 
 @pytest.mark.long
@@ -332,12 +332,12 @@ def test_a_goal_within_reach_is_measured_for(tmp_path):
         d.do(d.procedure.next())
     first = d.procedure.predicted()
     d = with_goal(d, 0.5 * (first.now_m + first.floor_m))
-    found = d.do(d.procedure.next())
-    assert found.reason == "goal"
-    assert found.then_m < first.now_m
-    kinds, found = until_decided(d)
+    decision = d.do(d.procedure.next())
+    assert decision.reason == "goal"
+    assert decision.then_m < first.now_m
+    kinds, decision = until_decided(d)
     assert kinds[:3] == ["measure", "refine", "decide"]
-    assert found.error.now_m < first.now_m
+    assert decision.error.now_m < first.now_m
     with CampaignFile.open(d.procedure.run) as run:
         log = RunLog(run)
         assert len(log.plans) > 1

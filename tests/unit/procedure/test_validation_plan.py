@@ -32,7 +32,10 @@ def test_a_loaded_reading_keeps_its_unloaded_one(space, seed):
         return tuple(tuple((int(p), 0) for p in part) for part in parts)
 
     before = LoadBlock(UNLOADED, loops(np.arange(1, 13)), 1.0)
-    blocks = [LoadBlock(load, loops(own), 1.0) for load, own in zip(loads, each, strict=True)]
+    blocks = [
+        LoadBlock(load, loops(poses_of_load), 1.0)
+        for load, poses_of_load in zip(loads, each, strict=True)
+    ]
     steps = steps_of(names, before, blocks, LoadBlock(UNLOADED, (), 0.0))
     plan = Plan((REFERENCE, *names), rng.normal(size=(13, 6)), steps)
     kept = fewer_returns(plan, space).steps
