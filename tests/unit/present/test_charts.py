@@ -27,13 +27,13 @@ def judged():
 
 
 @pytest.fixture(scope="module")
-def told():
+def example_story():
     return story()
 
 
 @pytest.fixture
-def first(told):
-    return told, told.revisions[0]
+def first(example_story):
+    return example_story, example_story.revisions[0]
 
 
 def points(figure, axis):
@@ -42,22 +42,22 @@ def points(figure, axis):
     return np.sort(np.concatenate(values))
 
 
-def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown(told):
-    figure = charts.error_per_revision(told)
+def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown(example_story):
+    figure = charts.error_per_revision(example_story)
     for trace, key in zip(figure.data[:2], ("error", "holdout"), strict=True):
-        rms = [1e6 * getattr(r, key).rms_m for r in told.revisions]
+        rms = [1e6 * getattr(r, key).rms_m for r in example_story.revisions]
         np.testing.assert_allclose(np.asarray(trace.x), rms)
         assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes
-    assert floor.x0 == pytest.approx(1e6 * told.noise_floor_m)
+    assert floor.x0 == pytest.approx(1e6 * example_story.noise_floor_m)
     assert description_of(figure).startswith("The rms error fell from")
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
 def test_measured_over_predicted_differs_by_the_residual(mode):
-    told = story(mode=mode)
-    r = told.revisions[0]
-    line, *axes = charts.measured_predicted(told, r).data
+    example_story = story(mode=mode)
+    r = example_story.revisions[0]
+    line, *axes = charts.measured_predicted(example_story, r).data
     assert line.name == "exact"
     for k, trace in enumerate(axes):
         off = np.asarray(trace.y, float) - np.asarray(trace.x, float)
@@ -65,15 +65,15 @@ def test_measured_over_predicted_differs_by_the_residual(mode):
 
 
 def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(first):
-    told, r = first
-    timed = replace(told, time_s=60.0 * np.arange(len(told)))
-    by_joint = charts.residual_by_joint(told, r, 1)
+    example_story, r = first
+    timed = replace(example_story, time_s=60.0 * np.arange(len(example_story)))
+    by_joint = charts.residual_by_joint(example_story, r, 1)
     limits = (0.0, *charts.sigma_limits(3), np.inf)
     for figure in (
-        charts.residual_by_pose(told, r),
-        charts.residual_by_load(told, r),
+        charts.residual_by_pose(example_story, r),
+        charts.residual_by_load(example_story, r),
         by_joint,
-        charts.residual_by_time(told, r),
+        charts.residual_by_time(example_story, r),
         charts.residual_by_time(timed, r),
     ):
         np.testing.assert_allclose(points(figure, "y"), np.sort(r.sigma), rtol=1e-6)
@@ -85,72 +85,76 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
                 charts.SYMBOLS[k],
             )
             assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
-    np.testing.assert_allclose(points(by_joint, "x"), np.sort(np.degrees(told.q[:, 1])), rtol=1e-6)
+    np.testing.assert_allclose(
+        points(by_joint, "x"), np.sort(np.degrees(example_story.q[:, 1])), rtol=1e-6
+    )
     worst = int(np.argmax(r.whitened_norm2))
     size = 1e6 * np.linalg.norm(r.residual[worst])
-    name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"
+    name = f"{example_story.pose_name(worst)}, {example_story.load_names[worst]}: {size:.0f} µm"
     assert any(text.startswith(name) for trace in by_joint.data for text in trace.text)
 
 
 def test_a_distance_has_one_element(first):
-    """Whole readings of one element: their rms in σ, their levels and the lines are its own."""
-    told, r = first
-    one = replace(r, elements=np.ones(len(told), dtype=int))
+    """The rms in σ, the levels and the limit lines are those of readings with one element."""
+    example_story, r = first
+    one = replace(r, elements=np.ones(len(example_story), dtype=int))
     assert one.level.sum() > r.level.sum()
-    figure = charts.residual_by_load(told, one)
-    rms = np.sqrt([np.mean(one.whitened_norm2[of]) for of in _by_load(told)])
+    figure = charts.residual_by_load(example_story, one)
+    rms = np.sqrt([np.mean(one.whitened_norm2[of]) for of in _by_load(example_story)])
     assert f"with {numbers.digits(max(rms), 2)} times the noise rms" in description_of(figure)
     lines = [shape.y0 for shape in figure.layout.shapes]
     np.testing.assert_allclose(lines, [2.5758, 3.8906], atol=1e-4)  # of a normal distribution
 
 
 def test_gross_errors_are_drawn_and_in_no_sentence(first):
-    told, r = first
-    off = np.arange(len(told)) == 3
-    measured, norm2 = told.measured + off[:, None], np.where(off, 1e8, r.whitened_norm2)
+    example_story, r = first
+    off = np.arange(len(example_story)) == 3
+    measured, norm2 = example_story.measured + off[:, None], np.where(off, 1e8, r.whitened_norm2)
     wrong = replace(r, residual=r.residual + off[:, None], whitened_norm2=norm2)
-    story = replace(told, measured=measured, set_aside=off)
+    story = replace(example_story, measured=measured, set_aside=off)
     for draw in (charts.residual_by_pose, charts.residual_by_load):
         figure = draw(story, wrong)
         assert points(figure, "y").max() == pytest.approx(1e4)
         assert not re.search(r"\d{3,} times", description_of(figure))
     share = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(story, wrong)))
-    before = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(told, r)))
+    before = re.search(
+        r"for ([0-9.]+) %", description_of(charts.measured_predicted(example_story, r))
+    )
     assert float(share[1]) == pytest.approx(float(before[1]), abs=2.0)
 
 
-def _by_load(told):
-    return [np.array(told.load_names) == name for name in set(told.load_names)]
+def _by_load(example_story):
+    return [np.array(example_story.load_names) == name for name in set(example_story.load_names)]
 
 
 @pytest.mark.parametrize("plane", ["xy", "xz"])
 def test_arrows_are_the_residuals_enlarged(plane, first):
-    told, r = first
+    example_story, r = first
     largest = float(r.size_m.max())
     times = round_factor(charts.LONGEST / largest, (1, 2, 5))
     assert 0.4 * charts.LONGEST <= times * largest <= charts.LONGEST
     lengths = []
-    for trace in charts.workspace(told, r, plane).data:
+    for trace in charts.workspace(example_story, r, plane).data:
         if trace.mode == "lines":
             xy = np.stack([np.asarray(getattr(trace, a), float) for a in "xy"], 1)
             lengths.append(np.linalg.norm(xy[1::3] - xy[::3], axis=1))
-    seen = r.residual[:, ["xyz".index(a) for a in plane]]
-    expected = np.sort(times * np.linalg.norm(seen, axis=1))
+    in_plane = r.residual[:, ["xyz".index(a) for a in plane]]
+    expected = np.sort(times * np.linalg.norm(in_plane, axis=1))
     np.testing.assert_allclose(np.sort(np.concatenate(lengths)), expected, atol=1e-6)
 
 
 def test_of_very_many_readings_the_worst_are_drawn_and_it_is_said():
-    told = story(poses=100)
-    r = told.revisions[0]
-    some = charts.chart_readings(told, r, max_points=50)
+    example_story = story(poses=100)
+    r = example_story.revisions[0]
+    some = charts.chart_readings(example_story, r, max_points=50)
     assert set(np.argsort(-r.whitened_norm2)[:10]) <= set(some.index.tolist())
     assert len(some.index) == 50
     assert "Of 300 readings 50 are drawn" in some.note
 
 
 def test_a_pose_named_like_markup_stays_text():
-    told = story(names="<script>alert(1)</script>")
-    figure = charts.residual_by_load(told, told.revisions[0])
+    example_story = story(names="<script>alert(1)</script>")
+    figure = charts.residual_by_load(example_story, example_story.revisions[0])
     words = [*figure.layout.xaxis.ticktext, *(n for t in figure.data for n in t.text)]
     assert words
     assert not any("<" in w for w in words)
@@ -158,11 +162,14 @@ def test_a_pose_named_like_markup_stays_text():
 
 def test_an_added_variable_plot_shows_its_slope():
     d = judged()
-    found = regressor(d.fit, d.suspects[0])
-    figure = charts.added_variable(found, "joint_tilt_compliance")
-    assert np.polyfit(found.x, found.y, 1)[0] == pytest.approx(1.0, abs=0.2)
-    assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in description_of(figure)
-    np.testing.assert_allclose(np.asarray(figure.data[0].y, float), found.y, atol=1e-3)
+    variable = regressor(d.fit, d.suspects[0])
+    figure = charts.added_variable(variable, "joint_tilt_compliance")
+    assert np.polyfit(variable.x, variable.y, 1)[0] == pytest.approx(1.0, abs=0.2)
+    assert (
+        f"slope {float(variable.x @ variable.y / (variable.x @ variable.x)):.2f}"
+        in description_of(figure)
+    )
+    np.testing.assert_allclose(np.asarray(figure.data[0].y, float), variable.y, atol=1e-3)
 
 
 def test_shares_and_curves_of_the_misfit():
@@ -217,15 +224,19 @@ def test_the_noise_check_of_distances_counts_what_is_read():
 
 
 def test_the_middle_of_a_variable_has_no_negative_zero(first):
-    told, r = first
-    values = np.linspace(-50.0, 50.0, len(told)) - 0.01
-    assert " up to 0.0°" in description_of(charts.residual_over(told, r, values, "angle", "°"))
+    example_story, r = first
+    values = np.linspace(-50.0, 50.0, len(example_story)) - 0.01
+    assert " up to 0.0°" in description_of(
+        charts.residual_over(example_story, r, values, "angle", "°")
+    )
 
 
 def test_a_long_name_of_a_load_is_shortened_at_the_axis(first):
-    told, r = first
-    names = tuple(f"a load that is pulled to the side, {name}" for name in told.load_names)
-    ticks = charts.residual_by_load(replace(told, load_names=names), r).layout.xaxis.ticktext
+    example_story, r = first
+    names = tuple(f"a load that is pulled to the side, {name}" for name in example_story.load_names)
+    ticks = charts.residual_by_load(
+        replace(example_story, load_names=names), r
+    ).layout.xaxis.ticktext
     assert all(t.startswith("…") and len(t) == charts.LONGEST_NAME for t in ticks)
 
 
@@ -236,8 +247,8 @@ def test_colours_stand_out_on_both_papers(color, paper):
     assert contrast(*rgb) >= 3.0
 
 
-def test_a_scheme_changes_the_look_and_nothing_else(told):
-    figure = charts.error_per_revision(told)
+def test_a_scheme_changes_the_look_and_nothing_else(example_story):
+    figure = charts.error_per_revision(example_story)
     dark = charts.in_scheme(figure, dark=True)
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
     assert (dark.data, description_of(dark)) == (figure.data, description_of(figure))

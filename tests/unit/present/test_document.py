@@ -33,8 +33,8 @@ def test_a_caption_is_its_own_or_the_heading_above_or_what_is_given():
 
 
 def test_a_page_has_a_paragraph_for_each_line():
-    found = captioned(["first\n  second\n", "", note("small\n")])
-    assert found == (Words("first"), Words("second"), Words("small", "note"))
+    paragraphs = captioned(["first\n  second\n", "", note("small\n")])
+    assert paragraphs == (Words("first"), Words("second"), Words("small", "note"))
     code = Words("[ordinary]\ncreep = 0.1", "code")
     assert captioned([code]) == (code,)
 

@@ -25,12 +25,12 @@ from tests.support.viewer_story import story
 pytestmark = pytest.mark.usefixtures("strict")
 
 
-def recorded(path, told, end=True):
-    """Draw what is told into a file."""
+def recorded(path, timed_events, end=True):
+    """Draw events or stories, each at its time, into a file."""
     rec = rr.RecordingStream("hilcal", recording_id="test", send_properties=False)
     rec.set_sinks(rr.FileSink(str(path)))
     scene = live.LiveScene(rec, batches=True)
-    for wall, what in told:
+    for wall, what in timed_events:
         scene.draw(wall, what)
     if end:
         scene.end(to_open=True)
@@ -39,13 +39,13 @@ def recorded(path, told, end=True):
 
 
 def revisions():
-    told = story()
-    for k, r in enumerate(told.revisions):
-        yield float(k), replace(told, revisions=(r,))
+    example_story = story()
+    for k, r in enumerate(example_story.revisions):
+        yield float(k), replace(example_story, revisions=(r,))
 
 
-def stored(told, wrong=6.0):
-    return [e for _, e in events(told, wrong) if isinstance(e, ReadingStored)]
+def stored(start, wrong=6.0):
+    return [e for _, e in events(start, wrong) if isinstance(e, ReadingStored)]
 
 
 def of_levels(path):
@@ -64,25 +64,27 @@ def refined(tmp_path_factory):
 
 
 def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong(measured):
-    found = [judgement_of(e.step, e.live) for e in stored(measuring())[READINGS_BEFORE_MODEL:]]
-    levels = np.array([j.level for j in found])
+    judgements = [judgement_of(e.step, e.live) for e in stored(measuring())[READINGS_BEFORE_MODEL:]]
+    levels = np.array([j.level for j in judgements])
     arrows = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
     assert (
         len(values(measured, "/world/live/1/dots", "Points3D:positions")) == READINGS_BEFORE_MODEL
     )
     outside = np.linalg.norm(arrows, axis=1) > BALL
     assert outside.tolist() == (levels > 0).tolist()
-    assert 5 < outside.sum() < len(found) / 2
+    assert 5 < outside.sum() < len(judgements) / 2
     red = (style.LEVEL_COLORS[2].astype(int) * [1 << 24, 1 << 16, 1 << 8]).sum() + 255
     colors = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:colors"))[:, 0]
     assert ((colors == red) == (levels == 2)).all()
-    assert of_levels(measured)[2] == pytest.approx([j.sigma for j in found if j.level == 2])
+    assert of_levels(measured)[2] == pytest.approx([j.sigma for j in judgements if j.level == 2])
 
 
 def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
-    told = measuring(plan(200))
-    path = recorded(tmp_path / "many.rrd", events(told))
-    outside = [judgement_of(e.step, e.live).level > 0 for e in stored(told)[READINGS_BEFORE_MODEL:]]
+    start = measuring(plan(200))
+    path = recorded(tmp_path / "many.rrd", events(start))
+    outside = [
+        judgement_of(e.step, e.live).level > 0 for e in stored(start)[READINGS_BEFORE_MODEL:]
+    ]
     arrows = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(arrows) == MANY + sum(outside[MANY:]) < len(outside)
     assert sum(map(len, of_levels(path))) == len(outside)
@@ -90,14 +92,14 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
 
 @pytest.mark.long
 def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
-    told = measuring(plan(MAX_SINGLE_RESIDUALS // 2 + 100))
-    path = recorded(tmp_path / "thousands.rrd", events(told, wrong=2.0))
+    start = measuring(plan(MAX_SINGLE_RESIDUALS // 2 + 100))
+    path = recorded(tmp_path / "thousands.rrd", events(start, wrong=2.0))
     sigma = np.array(
-        [judgement_of(e.step, e.live).sigma for e in stored(told, 2.0)[READINGS_BEFORE_MODEL:]]
+        [judgement_of(e.step, e.live).sigma for e in stored(start, 2.0)[READINGS_BEFORE_MODEL:]]
     )
-    group = -(-len(told.plan.steps) // GROUPS)
+    group = -(-len(start.plan.steps) // GROUPS)
     shown = np.sort(np.concatenate(of_levels(path)))
-    assert LiveTally(told).group == group == 8
+    assert LiveTally(start).group == group == 8
     assert len(shown) < 0.45 * len(sigma)
     worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
     assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
@@ -112,9 +114,9 @@ def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
 def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     one = measuring()
     targets = np.vstack([one.targets, [[-0.1, 0.05, 0.02]]])
-    told = replace(one, targets=targets, names=("left", "right"))
-    shown, rng, d = [], np.random.default_rng(2), LiveTally(told)
-    for wall, e in events(told, wrong=0.0):
+    start = replace(one, targets=targets, names=("left", "right"))
+    shown, rng, d = [], np.random.default_rng(2), LiveTally(start)
+    for wall, e in events(start, wrong=0.0):
         if isinstance(e, ReadingStored):
             right = residual(rng, 9.0) if e.stored > READINGS_BEFORE_MODEL else LiveResidual()
             e = replace(e, other_targets=((1, right),))
@@ -127,7 +129,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     apart = np.linalg.norm(targets[1] - targets[0])
     assert np.linalg.norm(both[1] - both[0]) == pytest.approx(apart)
     assert "right" in values(path, "/world/live/1/last", "Points3D:labels")[-1][0]
-    assert d.judged == 2 * (len(told.plan.steps) - READINGS_BEFORE_MODEL)
+    assert d.judged == 2 * (len(start.plan.steps) - READINGS_BEFORE_MODEL)
     assert {j.target for j in d.worst} == {"right"}
     assert " right |" in style.markdown(d.report())
 
@@ -143,9 +145,9 @@ def test_a_long_campaign_is_a_small_file(tmp_path):
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):
-    told = [e for _, e in events(measuring()) if isinstance(e, ArmPosition)]
+    positions = [e for _, e in events(measuring()) if isinstance(e, ArmPosition)]
     places = np.array(values(measured, "/world/live/1/arm", "Capsules3D:translations"))
-    assert len(places) == len(told) + 1  # and where it begins
+    assert len(places) == len(positions) + 1  # and where it begins
     assert np.abs(np.diff(places, axis=0)).max() > 0.05
 
 
@@ -175,11 +177,11 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):
     made = plan(6)
-    told = measuring(made, tuple((1000.0 + k, step) for k, step in enumerate(made.steps[:4])))
-    path = recorded(tmp_path / "resumed.rrd", [(2000.0, told)])
+    start = measuring(made, tuple((1000.0 + k, step) for k, step in enumerate(made.steps[:4])))
+    path = recorded(tmp_path / "resumed.rrd", [(2000.0, start)])
     assert len(values(path, "/world/live/1/dots", "Points3D:positions")) == 4
-    found = chunks(path, "/world/live/1/dots")
-    times = [t for c in found for t in c.to_record_batch()["time"].to_pylist()]
+    dots = chunks(path, "/world/live/1/dots")
+    times = [t for c in dots for t in c.to_record_batch()["time"].to_pylist()]
     assert [t.timestamp() for t in times] == [1000.0, 1001.0, 1002.0, 1003.0]
 
 
@@ -197,8 +199,8 @@ def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refi
 
 def test_other_readings_begin_another_story(tmp_path):
     other = story(poses=12)
-    told = [*revisions(), (9.0, replace(other, revisions=(other.revisions[-1],)))]
-    path = recorded(tmp_path / "two.rrd", told, end=False)
+    timed_stories = [*revisions(), (9.0, replace(other, revisions=(other.revisions[-1],)))]
+    path = recorded(tmp_path / "two.rrd", timed_stories, end=False)
     assert len(values(path, "/errors/fit", "BarChart:values")) == 5
     tables = [row[0] for row in values(path, "/words/revisions", "TextDocument:text")]
     assert tables[-1].count("\n|") < tables[-2].count("\n|")

@@ -80,8 +80,8 @@ def readings(path):
     if not path.exists() or path.stat().st_size == 0:
         return 0
     try:
-        found = [RrdReader(path).stream().filter(content=f"/live/1/{n}") for n in LEVEL_NAMES]
-        batches = [c.to_record_batch() for stream in found for c in stream.to_chunks()]
+        streams = [RrdReader(path).stream().filter(content=f"/live/1/{n}") for n in LEVEL_NAMES]
+        batches = [c.to_record_batch() for stream in streams for c in stream.to_chunks()]
         return sum(b.num_rows for b in batches if "Scalars:scalars" in b.schema.names)
     except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
         return 0
@@ -94,10 +94,10 @@ def alive(pid):
 @growing
 @pytest.mark.long
 def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, said):
-    with socket.socket() as taken:  # the wanted port: the next one is taken instead
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with socket.socket() as listener:  # the wanted port: the next one is taken instead
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
         live = LiveViewer(home / "run.live.rrd", said.append, port)
         live.start()
     try:
@@ -185,10 +185,10 @@ def run(code, path, port):
 @pytest.mark.slow
 @posix
 def test_a_full_disk_ends_the_recording_only(home, free_port):
-    told = run(FULL, home / "full.live.rrd", free_port)
-    assert told.count("cannot be written") == 1
-    assert "everything else goes on" in told
-    assert "goes on True True" in told
+    printed = run(FULL, home / "full.live.rrd", free_port)
+    assert printed.count("cannot be written") == 1
+    assert "everything else goes on" in printed
+    assert "goes on True True" in printed
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def test_everything_is_told_and_fits(shown, width):
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text  # nothing is cut off
     words = " ".join(text.split())
-    for told in (
+    for phrase in (
         "3 and the reference",
         "10: unloaded 6, 10kg 2, pull x 2",
         "6 min",
@@ -51,7 +51,7 @@ def test_everything_is_told_and_fits(shown, width):
         "These readings cannot detect tracker_drift.",
         "note: only 3 candidates are left of load 10kg.",
     ):
-        assert told in words
+        assert phrase in words
     assert text.index("joint_tilt") < text.index("hysteresis  ")  # the best seen comes first
 
 
@@ -120,14 +120,14 @@ def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown):
 def test_the_order_is_stated_with_its_cost_and_what_it_saves():
     order = replace(SUMMARY.confounding, drift_std=17e-6 / 3600)
     words = order_remark(replace(SUMMARY, confounding=order))
-    for told in (
+    for phrase in (
         "3.0 % longer",
         "up to about 2 % of a parameter's information (40 % in the shortest order)",
         "a drift of 18 µm/h shifts deflections by 5.00 µm rms",
         "and less than 0.1 µm on average",
         "determine it to ± 17 µm/h",
     ):
-        assert told in words
+        assert phrase in words
     order = replace(order, bias_m=5e-6, drift_std=None)
     plain = order_remark(replace(SUMMARY, longer=0.0, confounding=order))
     assert plain.startswith("The order is the shortest one. ")
@@ -203,10 +203,10 @@ def test_with_positions_it_is_an_exchange_table(tmp_path):
     path = tmp_path / "measured.csv"
     path.write_text("\n".join(text) + "\n", encoding="utf-8")
     read = read_table(path, arm, None)
-    taken = [
+    steps = [
         Step(read.pose_names[p], read.load_names[load], int(c))
         for p, load, c in zip(read.pose, read.load, read.cycle, strict=True)
     ]
-    assert tuple(taken) == STEPS
+    assert tuple(steps) == STEPS
     np.testing.assert_array_equal(read.states.q, q)
     np.testing.assert_array_equal(read.states.wrench[2:4], [PULL, np.zeros(6)])

@@ -76,8 +76,8 @@ def text(made):
 
 @pytest.fixture(scope="module")
 def browser():
-    with open_browser() as found:
-        yield found
+    with open_browser() as chromium:
+        yield chromium
 
 
 def plain(m):
@@ -87,12 +87,14 @@ def plain(m):
 
 def large(m):
     """The same with many revisions, poses of long names, and instruments, with no appendix."""
-    told, count = m.story, len(m.story)
+    original, count = m.story, len(m.story)
     change = ["", *["+ periodic_joint_compliance"] * 11]
-    many = tuple(replace(told.revisions[-1], revision=k, change=c) for k, c in enumerate(change))
+    many = tuple(
+        replace(original.revisions[-1], revision=k, change=c) for k, c in enumerate(change)
+    )
     named = tuple(f"calibration pose number {k:03d}" for k in range(count))
     pose, time_s = np.arange(count), 60.0 * np.arange(count)
-    story = replace(told, revisions=many, pose_names=named, pose=pose, time_s=time_s)
+    story = replace(original, revisions=many, pose_names=named, pose=pose, time_s=time_s)
     name, facts = "Leica AT960-MR", {"firmware": "3.1"}
     device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.created)
     overview = replace(m.overview, instruments=(device,) * 5)
@@ -104,11 +106,11 @@ def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text):
     assert outline.tags.count("h1") == 1
     levels = [int(t[1]) for t in outline.tags if re.fullmatch(r"h[1-6]", t)]
     assert all(b <= a + 1 for a, b in itertools.pairwise(levels)), levels
-    for name, found in outline.found:
-        assert not (name in ("script", "img", "iframe") and "src" in found)
-        if found.get("class") == "chart":
-            assert len(found["aria-label"]) > 20
-            assert found["role"] == "img"
+    for name, attributes in outline.found:
+        assert not (name in ("script", "img", "iframe") and "src" in attributes)
+        if attributes.get("class") == "chart":
+            assert len(attributes["aria-label"]) > 20
+            assert attributes["role"] == "img"
     assert set(outline.of("th", "scope")) <= {"row", "col"}
     assert set(outline.of("link", "href")) == {"data:,"}
     assert outline.tags.count("table") == outline.tags.count("caption")
@@ -140,9 +142,9 @@ def test_names_are_text_and_what_is_in_scripts_is_json(text):
     assert EVIL not in text
     assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]
     assert "&lt;script&gt;" in text
-    found = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
-    assert len(found) > 10
-    assert all("data" in json.loads(script) for script in found)
+    scripts = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    assert len(scripts) > 10
+    assert all("data" in json.loads(script) for script in scripts)
 
 
 def test_numbers_of_the_certificate_are_those_of_the_fit(made, text):
@@ -350,8 +352,8 @@ def test_printed_pages_are_numbered_light_and_end_with_no_heading(made, browser,
     with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, _):
         titles = set(page.locator("h2, h3, caption").all_text_contents())
         page.pdf(path=pdf, prefer_css_page_size=True, print_background=True)
-    told = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True)
-    pages = [[x.strip() for x in p.splitlines() if x.strip()] for p in told.stdout.split("\f")]
+    process = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True)
+    pages = [[x.strip() for x in p.splitlines() if x.strip()] for p in process.stdout.split("\f")]
     pages = [p for p in pages if p]
     assert len(pages) > 5
     for k, lines in enumerate(pages, start=1):

@@ -22,7 +22,7 @@ from tests.unit.diagnosis.test_residual_regression import hidden
 
 
 @cache
-def told(effect):
+def story_of(effect):
     """A rehearsed campaign before and after its hidden effect is added."""
     r = rehearsal(effect)
     first = fitted_model(r.cell, r.readings, r.mode)
@@ -34,7 +34,7 @@ def told(effect):
 
 @pytest.mark.parametrize("effect", first(1, ["hysteresis", "encoder_offset"]))
 def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_one(effect):
-    story = told(effect)
+    story = story_of(effect)
     first, last = story.revisions
     assert [(r.revision, r.change) for r in (first, last)] == [(4, ""), (5, f"+ {effect}")]
     assert (first.verdict, last.verdict) == ("missing_effect", "adequate")
@@ -55,7 +55,7 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
 
 
 def test_vectors_are_in_base_axes():
-    r, story = rehearsal("hysteresis"), told("hysteresis")
+    r, story = rehearsal("hysteresis"), story_of("hysteresis")
     whitening = full_prediction(fitted_model(r.cell, r.readings, r.mode)).whitening
     expected = whitening.raw(r.readings.value) @ r.world.registration[:3, :3]
     # Deflections leave the base's turning open by what the closed form knows, some mrad.
@@ -84,7 +84,7 @@ def test_a_distance_is_drawn_along_the_line_that_is_measured(mode):
 
 
 def test_arrows_start_at_the_nominal_target():
-    r, story = rehearsal("encoder_offset"), told("encoder_offset")
+    r, story = rehearsal("encoder_offset"), story_of("encoder_offset")
     nominal = evaluate(r.cell.arm, story.q).point(r.cell.target[:3, 3])
     np.testing.assert_allclose(story.anchor, nominal, atol=1e-12)
     assert np.linalg.norm(story.measured - story.anchor, axis=1).max() < 0.01
@@ -123,11 +123,11 @@ def test_an_unknown_effect_has_a_curve_in_units_for_people():
 )
 def test_units_of_a_variable_are_those_of_people(unit, end, label, factor):
     x, y, up = np.array([0.0, end]), np.array([-2e-3, 2e-3]), np.array([0.0, 0.0, 1.0])
-    found = curve(Dependence("time", unit, 0.5, "target", up, x, y, np.full(2, 1e-4), "m"))
-    assert found.x_label == label
-    np.testing.assert_allclose(found.x, factor * x)
-    assert found.y_label == "error of the target along base z [mm]"
-    np.testing.assert_allclose(found.y, [-2.0, 2.0])
+    line = curve(Dependence("time", unit, 0.5, "target", up, x, y, np.full(2, 1e-4), "m"))
+    assert line.x_label == label
+    np.testing.assert_allclose(line.x, factor * x)
+    assert line.y_label == "error of the target along base z [mm]"
+    np.testing.assert_allclose(line.y, [-2.0, 2.0])
     aslant = Dependence("load", "", 0.5, "target", np.array([0.6, 0.0, 0.8]), x, y, y, "m")
     assert "the target along (0.60, 0.00, 0.80) in base axes" in curve(aslant).y_label
 
@@ -136,20 +136,20 @@ def test_gross_errors_are_shown_as_well():
     r = rehearsal("nothing")
     value = r.readings.value.copy()
     value[17] += 0.004
-    found = fitted_model(r.cell, replace(r.readings, value=value), "absolute")
-    assert found.outlier.any()
-    story = build_story([Chapter(1, None, found, None)])
+    fitted = fitted_model(r.cell, replace(r.readings, value=value), "absolute")
+    assert fitted.outlier.any()
+    story = build_story([Chapter(1, None, fitted, None)])
     assert len(story) == len(value)
     assert int(np.argmax(story.revisions[0].whitened_norm2)) == 17
-    apart = of_left_out(story.revisions[0], found)
+    apart = of_left_out(story.revisions[0], fitted)
     np.testing.assert_allclose(story.measured - apart.predicted, apart.residual, atol=1e-12)
     assert apart.whitened_norm2.sum() > story.revisions[0].whitened_norm2.sum()
     left = apart.size_m
     assert int(np.argmax(left)) == 17
-    kept = left_out_errors(found)
-    np.testing.assert_allclose(np.sort(left[~found.outlier]), np.sort(kept), rtol=1e-9)
-    assert kept.max() == pytest.approx(found.holdout.max_m)
-    assert np.sqrt(np.mean(kept**2)) == pytest.approx(found.holdout.rms_m, rel=1e-9)
+    kept = left_out_errors(fitted)
+    np.testing.assert_allclose(np.sort(left[~fitted.outlier]), np.sort(kept), rtol=1e-9)
+    assert kept.max() == pytest.approx(fitted.holdout.max_m)
+    assert np.sqrt(np.mean(kept**2)) == pytest.approx(fitted.holdout.rms_m, rel=1e-9)
 
 
 def test_other_readings_do_not_make_one_story():

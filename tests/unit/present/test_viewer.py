@@ -37,14 +37,14 @@ LONG = (
 
 
 @pytest.fixture(scope="module")
-def told():
+def example_story():
     return story()
 
 
 @pytest.fixture(scope="module")
-def recording(told, tmp_path_factory):
+def recording(example_story, tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "story.rrd"
-    save(told, path)
+    save(example_story, path)
     return path
 
 
@@ -64,14 +64,14 @@ def bars(path, entity, revision):
     return left, left + np.array(width), height
 
 
-def test_every_revision_has_its_errors_in_micrometres(told, recording):
-    of = told.revisions
+def test_every_revision_has_its_errors_in_micrometres(example_story, recording):
+    of = example_story.revisions
     numbers = np.array([r.revision for r in of])
     for name, sizes in {
         "fit": [r.error.rms_m for r in of],
         "holdout": [r.holdout.rms_m for r in of],
         "largest": [r.error.max_m for r in of],
-        "noise": [told.noise_floor_m] * len(of),
+        "noise": [example_story.noise_floor_m] * len(of),
     }.items():
         for shown in numbers:
             left, right, height = bars(recording, f"/errors/{name}", shown)
@@ -84,9 +84,9 @@ ONE = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
 
 @pytest.mark.parametrize(("curve", "width"), [(ANGLE, None), (LOAD, 1.0), (ONE, 1.0)])
 def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
-    told, path = doubtful(), tmp_path / "doubt.rrd"
-    revisions = (replace(told.revisions[2], dependence=curve), told.revisions[3])
-    save(replace(told, revisions=revisions), path)
+    example_story, path = doubtful(), tmp_path / "doubt.rrd"
+    revisions = (replace(example_story.revisions[2], dependence=curve), example_story.revisions[3])
+    save(replace(example_story, revisions=revisions), path)
     left, right, height = bars(path, "/follows/mean", 2)
     np.testing.assert_allclose(height, curve.y)
     np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
@@ -123,19 +123,19 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(reco
     }
 
 
-def test_bars_hold_every_pose_once_and_the_tallest_is_the_worst_reading(told, by_revision):
+def test_bars_hold_every_pose_once_and_the_tallest_is_the_worst_reading(example_story, by_revision):
     labels = by_revision("/world/residual/worst", "Points3D:labels")
     drawn = [by_revision(f"/bars/{name}", "BarChart:values") for name in style.LEVEL_NAMES]
-    for r in told.revisions:
+    for r in example_story.revisions:
         heights = np.concatenate([of[r.revision][0]["buffer"] for of in drawn])
         assert (heights > 0).sum() == 30
         assert f"({heights.max():.1f} σ)" in labels[r.revision][0]
 
 
-def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
+def test_a_pose_has_its_own_name_in_every_label_and_text(example_story, tmp_path):
     path = tmp_path / "named.rrd"
-    save(replace(told, pose_names=tuple(f"p{k + 40}a" for k in told.pose)), path)
-    name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
+    save(replace(example_story, pose_names=tuple(f"p{k + 40}a" for k in example_story.pose)), path)
+    name = f"p{example_story.pose[np.argmax(example_story.revisions[-1].whitened_norm2)] + 40}a"
     worst = rows(path, "/world/residual/worst", "Points3D:labels", "revision")
     assert f"pose {name}," in worst[3][0]
     assert f"pose {name}," in rows(path, "/words/details", "TextDocument:text", "revision")[3][0]
@@ -143,33 +143,37 @@ def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
     assert cards[7][0].startswith("### Pose p47a:")
 
 
-def test_every_reading_has_its_arrow_and_every_pose_a_ball(told, by_revision):
+def test_every_reading_has_its_arrow_and_every_pose_a_ball(example_story, by_revision):
     drawn = by_revision("/world/residual/arrows", "Arrows3D:vectors")
-    for r in told.revisions:
+    for r in example_story.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (90, 3)
-        length = np.linalg.norm(r.residual, axis=1) * campaign.residual_scale(told)
+        length = np.linalg.norm(r.residual, axis=1) * campaign.residual_scale(example_story)
         expected = np.minimum(length, campaign.ARROW_CAP)
         np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), expected, rtol=1e-5)
     balls = by_revision("/world/residual/noise", "Ellipsoids3D:half_sizes")
     assert {len(b) for b in balls.values()} == {30}
 
 
-def test_the_arm_moves_through_poses_and_stands_in_the_worst_one(told, recording, by_revision):
+def test_the_arm_moves_through_poses_and_stands_in_the_worst_one(
+    example_story, recording, by_revision
+):
     moves = rows(recording, "/world/arm/body6", "Transform3D:translation", "pose")
     assert sorted(moves) == list(range(30))
     read = np.array([moves[k][0] for k in range(30)])
-    np.testing.assert_allclose(read, body_poses(told.arm, told.q[::3])[:, 6, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(
+        read, body_poses(example_story.arm, example_story.q[::3])[:, 6, :3, 3], atol=1e-6
+    )
     stands = by_revision("/world/arm/body7", "Transform3D:translation")
-    for r in told.revisions:
+    for r in example_story.revisions:
         i = int(np.argmax(r.whitened_norm2))
-        expected = body_poses(told.arm, told.q[i : i + 1])[0, -1, :3, 3]
+        expected = body_poses(example_story.arm, example_story.q[i : i + 1])[0, -1, :3, 3]
         np.testing.assert_allclose(stands[r.revision][0], expected, atol=1e-6)
 
 
-def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
+def test_saving_twice_gives_equal_recordings(example_story, recording, tmp_path):
     again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
-    save(told, again)
+    save(example_story, again)
     save(story(seed=2), other)
     assert same(recording, again)
     assert not same(recording, other)
@@ -178,10 +182,10 @@ def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
 def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
     path = tmp_path / "names.rrd"
     save(story(poses=4, names=f" |{FORBIDDEN}\U0001f916\t*x*"), path)
-    found = texts(path)
-    assert any("joint_tilt_compliance" in t.replace("\\", "") for t in found)
-    assert [c for t in found for c in t if c in FORBIDDEN or ord(c) > 0x2FFF] == []
-    assert [t for t in found if style.storable(t) != t] == []
+    shown_texts = texts(path)
+    assert any("joint_tilt_compliance" in t.replace("\\", "") for t in shown_texts)
+    assert [c for t in shown_texts for c in t if c in FORBIDDEN or ord(c) > 0x2FFF] == []
+    assert [t for t in shown_texts if style.storable(t) != t] == []
 
 
 def test_user_names_cannot_break_a_table():
@@ -205,12 +209,14 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
 
 def test_noise_balls_give_the_covariance_back():
     a = 1e-5 * np.random.default_rng(3).standard_normal((12, 3, 3))
-    told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
-    half, quaternion = campaign.noise_balls(told, np.arange(12))
-    half = half / (style.BALL_SIGMAS * campaign.residual_scale(told))
+    example_story = replace(
+        story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3)
+    )
+    half, quaternion = campaign.noise_balls(example_story, np.arange(12))
+    half = half / (style.BALL_SIGMAS * campaign.residual_scale(example_story))
     rotation = Rotation.from_quat(quaternion).as_matrix()
     again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
-    np.testing.assert_allclose(again, told.covariance, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(again, example_story.covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_levels_hold_the_share_of_noise_they_name():
@@ -220,9 +226,14 @@ def test_levels_hold_the_share_of_noise_they_name():
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
-    six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
+    six, example_story, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names", "q_min", "q_max")}
-    save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
+    save(
+        replace(
+            example_story, arm=replace(six, links=six.links[:5], **cut), q=example_story.q[:, :4]
+        ),
+        path,
+    )
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
 
 
@@ -251,9 +262,15 @@ def colors(png):
 @pytest.mark.vulkan
 @needs_vulkan
 def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
-    path, told = tmp_path / "doubt.rrd", doubtful()
-    long = replace(told.revisions[1], panels={"verdict": (LONG,)})
-    save(replace(told, revisions=(told.revisions[0], long, *told.revisions[2:])), path)
+    path, example_story = tmp_path / "doubt.rrd", doubtful()
+    long = replace(example_story.revisions[1], panels={"verdict": (LONG,)})
+    save(
+        replace(
+            example_story,
+            revisions=(example_story.revisions[0], long, *example_story.revisions[2:]),
+        ),
+        path,
+    )
     shots = [Shot(tmp_path / f"{k}.png", "revision", k, "Verdict") for k in range(4)]
     pictures(path, shots, (1280, 720))
     for shot in shots:
@@ -266,9 +283,9 @@ def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
 @pytest.mark.vulkan
 @pytest.mark.slow
 @needs_vulkan
-def test_every_view_is_drawn_without_a_report(told, recording, tmp_path):
+def test_every_view_is_drawn_without_a_report(example_story, recording, tmp_path):
     words = ("Verdict", "Details", "How to read this", "Table", "Log", "Parameters ± σ")
-    names = [*campaign.titles(told), campaign.ERRORS, campaign.FOLLOWS, *words]
+    names = [*campaign.titles(example_story), campaign.ERRORS, campaign.FOLLOWS, *words]
     shots = [Shot(tmp_path / f"{i}.png", "revision", 1, n) for i, n in enumerate(names)]
     shots.append(Shot(tmp_path / "pose.png", "pose", 7))
     reports = pictures(recording, shots, SIZE, LONGEST)
@@ -282,11 +299,13 @@ def test_every_view_is_drawn_without_a_report(told, recording, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypatch, free_port):
+def test_a_viewer_that_joins_late_gets_the_whole_story(
+    example_story, tmp_path, monkeypatch, free_port
+):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     late = tmp_path / "late.rrd"
-    with serve(told, port=free_port) as url:
+    with serve(example_story, port=free_port) as url:
         assert url == f"rerun+http://127.0.0.1:{free_port}/proxy"
         client = subprocess.Popen(
             [executable(), "--port", "auto", "--save", str(late), url],
@@ -311,12 +330,12 @@ def entities(path):
         return set()
 
 
-def test_a_port_in_use_is_refused(told, free_port):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", free_port))
-        taken.listen()
+def test_a_port_in_use_is_refused(example_story, free_port):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", free_port))
+        listener.listen()
         with pytest.raises(InputError, match=f"{free_port}.*free port"):
-            serve(told, port=free_port).__enter__()
+            serve(example_story, port=free_port).__enter__()
 
 
 @pytest.mark.long

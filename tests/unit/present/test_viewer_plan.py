@@ -255,9 +255,9 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
     )
     made = Plan((bad,), Q[:1], (Step(bad, UNLOADED), Step(bad, bad)))
     record_plan(cell, made, summary, tmp_path / "x.rrd")
-    found = texts(tmp_path / "x.rrd")
-    assert len(found) > 10
-    assert [t for t in found if style.storable(t) != t] == []
+    shown_texts = texts(tmp_path / "x.rrd")
+    assert len(shown_texts) > 10
+    assert [t for t in shown_texts if style.storable(t) != t] == []
 
 
 def test_what_does_not_fit_is_refused(shadowed, tmp_path):
@@ -276,8 +276,8 @@ def eye_place(path):
     (blueprint,) = reader.blueprints()
     name = "EyeControls3D:position"
     batches = (c.to_record_batch() for c in reader.stream(store=blueprint).to_chunks())
-    found = [v for b in batches if name in b.schema.names for v in b.column(name).to_pylist()]
-    return np.array(found[0][0])
+    positions = [v for b in batches if name in b.schema.names for v in b.column(name).to_pylist()]
+    return np.array(positions[0][0])
 
 
 def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
@@ -303,8 +303,8 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
 def test_what_stands_behind_an_obstacle_is_hidden_and_nothing_else(thing):
     behind, above, aside, before = [0, 0, 0.5], [0, 0, 2.0], [0, 1.5, 0.5], [1.5, 0, 0.5]
     points = np.array([behind, above, aside, before], dtype=float)
-    found = style.hidden_points(np.array([2.0, 0.0, 0.5]), points, (thing,))
-    assert found.tolist() == [True, False, False, False]
+    hidden = style.hidden_points(np.array([2.0, 0.0, 0.5]), points, (thing,))
+    assert hidden.tolist() == [True, False, False, False]
 
 
 def test_the_eye_is_as_near_as_shows_everything():

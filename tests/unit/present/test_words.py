@@ -57,8 +57,8 @@ def test_loads_of_which_nothing_is_left_are_told_in_one_sentence():
     names = [n for n in r.load_names if n != "none"][:2]
     lost = np.isin(r.load, [r.load_names.index(n) for n in names])
     fitted = fit(baseline(c.cell, r, "absolute"), r, "absolute", outlier=lost)
-    told = list(gross_error_lines(fitted, details=False))
-    (sentence,) = [line for line in told if "force" in line]
+    lines = list(gross_error_lines(fitted, details=False))
+    (sentence,) = [line for line in lines if "force" in line]
     assert sentence == (
         f"All {lost.sum()} readings under the loads {names[0]} and {names[1]} are set aside: "
         "check their forces."
@@ -239,13 +239,13 @@ PLACES = (
 
 
 def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
-    told = shown(*where_table(PLACES))
+    printed_table = shown(*where_table(PLACES))
     order = ["joint 4 angle", "load", "time", "same in all readings of a pose", "points vertical"]
-    places = [told.index(name) for name in order]
+    places = [printed_table.index(name) for name in order]
     assert places == sorted(places)
-    assert "joint 1 angle" not in told
-    assert not re.search(r"(?<!\d)0 %", told)
-    assert "2 more are below 1 %" in told
+    assert "joint 1 angle" not in printed_table
+    assert not re.search(r"(?<!\d)0 %", printed_table)
+    assert "2 more are below 1 %" in printed_table
 
 
 @pytest.mark.parametrize(
@@ -269,15 +269,15 @@ def test_a_place_has_no_negative_zero():
 
 
 def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown):
-    def told(error, share=0.3):
+    def curve_text(error, share=0.3):
         x, y = np.arange(5.0), 1e-5 * np.arange(-2.0, 3.0)
         of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, np.full(5, error), "rad")
         return shown(*curves([of]))
 
-    assert "error of joint 2:" in told(2e-6)
-    assert "do not determine its curve" in told(5e-2)
-    assert "±" not in told(5e-2)
-    assert told(2e-6, share=0.004) == ""
+    assert "error of joint 2:" in curve_text(2e-6)
+    assert "do not determine its curve" in curve_text(5e-2)
+    assert "±" not in curve_text(5e-2)
+    assert curve_text(2e-6, share=0.004) == ""
 
 
 @cache
@@ -335,21 +335,21 @@ def test_what_the_pose_alone_predicts_is_said_so(shown):
 def test_a_diagnosis_has_no_two_empty_lines_and_one_before_each_table(judged, printed):
     wrong = replace(judged.suspects[0], needs=(("m", 2.0, 1.0),))
     d = replace(judged, reason="no_suspect", suspects=(wrong, *judged.suspects[1:]))
-    for told in (printed(*diagnosis_report(judged)), printed(*diagnosis_report(d))):
-        lines = [line.strip() for line in told.split("\n")]
+    for text in (printed(*diagnosis_report(judged)), printed(*diagnosis_report(d))):
+        lines = [line.strip() for line in text.split("\n")]
         assert not any(lines[k] == lines[k + 1] == "" for k in range(len(lines) - 2))
         heads = [k for k, line in enumerate(lines) if line.startswith(("where the", "not named"))]
         assert heads
         assert all(lines[k - 1] == "" for k in heads)
-    assert "is implausible: it would need" in told
+    assert "is implausible: it would need" in text
 
 
 def test_a_curve_of_the_terminal_has_degrees(shown):
     x, y = np.array([-np.pi, 0.5 * np.pi]), np.array([-1e-3, 1e-3])
     of = ("joint 2", np.zeros(3), x, y, np.full(2, 1e-5), "rad")
-    told = shown(*curves([Dependence("joint 4 angle", "rad", 0.9, *of)]))
-    assert "joint 4 angle [°]" in told
-    assert "-180" in told
+    text = shown(*curves([Dependence("joint 4 angle", "rad", 0.9, *of)]))
+    assert "joint 4 angle [°]" in text
+    assert "-180" in text
 
 
 def test_an_error_falls_by_an_added_effect_only_where_a_diagnosis_says_so():
@@ -362,8 +362,8 @@ def test_an_error_falls_by_an_added_effect_only_where_a_diagnosis_says_so():
         said = change_sentence(before, after, effect, added=True)
         assert "does not fall by more than it scatters" in said
     missing = fitted("deflection", "base_compliance")
-    found = add(missing, "base_compliance")
-    assert " falls from " in change_sentence(missing, found, "base_compliance", added=True)
+    with_missing = add(missing, "base_compliance")
+    assert " falls from " in change_sentence(missing, with_missing, "base_compliance", added=True)
 
 
 @pytest.mark.long
