@@ -90,15 +90,15 @@ def test_a_change_is_a_revision_and_can_be_taken_back(run):
     catalogue = few_effects()
     with Campaign.open(run, catalogue) as o:
         before, stored = o.fit_in_use()[1], o.file.readings()
-        there, number, found = change_cell(o, None, before, COARSE, lambda words: None)
+        there, number, refinement = change_cell(o, None, before, COARSE, lambda words: None)
         assert (number, there.changes) == (2, COARSE)
-        assert found.fit.variance_factor < 0.2 * before.variance_factor
-        assert found.fit.model.named == before.model.named
+        assert refinement.fit.variance_factor < 0.2 * before.variance_factor
+        assert refinement.fit.model.named == before.model.named
         assert [(r.cell, r.made_from) for r in o.file.revisions()] == [({}, None), (COARSE, 1)]
     with Campaign.open(run, catalogue) as o:  # every command goes on in the changed cell
         assert (o.changes, o.config.tracker.range_std_m) == (COARSE, 4e-5)
         assert np.array_equal(o.file.readings().covariance, stored.covariance)
-        assert o.fit().variance_factor == pytest.approx(found.fit.variance_factor, rel=1e-6)
+        assert o.fit().variance_factor == pytest.approx(refinement.fit.variance_factor, rel=1e-6)
         assert [c.number for c in o.chapters()] == [2]
         refusal(r"fitted in a cell that .* hilcal accept .* 1$", o.fit, 1)
         kept = o.store(o.fit_in_use()[1])
@@ -118,9 +118,9 @@ def test_the_tools_figures_and_frames_are_those_of_the_change(run):
             "base_rotvec_rad": rotation_vector(place[:3, :3]).tolist(),
         }
         change = {"tool": {"mass_kg": 2.5}, "tracker": known}
-        there, _, found = change_cell(o, None, before, change, lambda words: None)
+        there, _, refinement = change_cell(o, None, before, change, lambda words: None)
         assert there.cell.tool_mass == 2.5
-        assert set(before.model.named) - set(found.fit.model.named) == {"base_frame"}
+        assert set(before.model.named) - set(refinement.fit.model.named) == {"base_frame"}
         back = there.with_cell({"tracker": dict.fromkeys(known)})  # to be estimated again
         assert not back.cell.registration_known
         assert back.changes["tool"] == {"mass_kg": 2.5}
@@ -163,5 +163,7 @@ def test_values_are_read_and_written_as_in_cell_toml():
         assert write_value(read_value("tool", "targets", text)) == text
     assert read_value("tool", "mass_kg", "  ") is None
     for text in ("one kilo", "1\n[tracker]", "1\nmass = 2", "[0.1, 0.2", "= 3", '"""'):
-        told = refusal("is not valid: it must be a mass in kg", read_value, "tool", "mass_kg", text)
-        assert len(told.splitlines()) == 1
+        message = refusal(
+            "is not valid: it must be a mass in kg", read_value, "tool", "mass_kg", text
+        )
+        assert len(message.splitlines()) == 1

@@ -71,8 +71,8 @@ def judged_or_refused(of, extra):
         if extra is None:
             assert hc.refine(model, readings, mode).verdict in VERDICTS.values()
         else:
-            found = hc.fit(model + hc.effect(extra), readings, mode)
-            assert hc.diagnose(found).verdict in VERDICTS.values()
+            fitted = hc.fit(model + hc.effect(extra), readings, mode)
+            assert hc.diagnose(fitted).verdict in VERDICTS.values()
     except HilcalError as error:
         refused = str(error)
     assert "\n" not in refused

@@ -185,11 +185,11 @@ def test_the_driver_of_the_guide_reports_and_entry_points_are_those_that_are_rea
     exec(dedent(code), known)
     tracker = known["open_tracker"](configuration())
     assert tracker.report().device == "tracker"
-    found = {}
+    groups = {}
     for page in ("add-a-device.md", "add-an-effect.md"):
         for text in blocks(HOW_TO / page, "toml"):
-            found |= tomllib.loads(text).get("project", {}).get("entry-points", {})
-    assert set(found) == {TRACKERS, ENTRY_POINT_GROUP}
+            groups |= tomllib.loads(text).get("project", {}).get("entry-points", {})
+    assert set(groups) == {TRACKERS, ENTRY_POINT_GROUP}
 
 
 def test_the_commands_of_the_guide_to_effects(campaign_of, monkeypatch, capsys):

@@ -54,9 +54,9 @@ def test_a_package_that_does_not_load_is_a_problem(tmp_path, monkeypatch):
     ],
 )
 def test_the_clock(year, status, state, said):
-    found = clock(lambda: datetime(year, 5, 1, tzinfo=UTC), lambda: status)
-    assert found.state == state
-    assert said in found.said
+    check = clock(lambda: datetime(year, 5, 1, tzinfo=UTC), lambda: status)
+    assert check.state == state
+    assert said in check.said
 
 
 def test_a_folder_that_can_be_measured_into_and_others(tmp_path, monkeypatch):
@@ -121,26 +121,26 @@ def system(tmp_path, port):
 
 
 def test_a_port_is_told_by_its_lasting_name(port, system):
-    (found,) = serial_ports({"tracker": port}, {port: "USB Serial"}, system(latency=1))
-    assert found.state == "ok"
-    assert found.name.startswith("tracker: ")
-    assert found.name.endswith("by-id/usb-FTDI_tracker")
-    assert "USB Serial" in found.said
+    (check,) = serial_ports({"tracker": port}, {port: "USB Serial"}, system(latency=1))
+    assert check.state == "ok"
+    assert check.name.startswith("tracker: ")
+    assert check.name.endswith("by-id/usb-FTDI_tracker")
+    assert "USB Serial" in check.said
 
 
 def test_a_slow_adapter_is_told_with_the_line_that_mends_it(port, system):
-    (found,) = serial_ports({}, {port: "USB Serial"}, system(latency=16))
-    assert found.state == "warning"
-    assert "up to 16 ms" in found.said
-    assert found.mend.startswith("echo 1 | sudo tee ")
-    assert found.mend.endswith("/latency_timer")
+    (check,) = serial_ports({}, {port: "USB Serial"}, system(latency=16))
+    assert check.state == "warning"
+    assert "up to 16 ms" in check.said
+    assert check.mend.startswith("echo 1 | sudo tee ")
+    assert check.mend.endswith("/latency_timer")
 
 
 def test_a_port_of_the_cell_that_is_not_there(port, system, tmp_path):
     at = system()
-    found = serial_ports({"tracker": str(tmp_path / "ttyUSB7")}, {port: "USB Serial"}, at)
-    assert found[0].state == "problem"
-    assert "usb-FTDI_tracker" in found[0].mend  # which there is instead
+    checks = serial_ports({"tracker": str(tmp_path / "ttyUSB7")}, {port: "USB Serial"}, at)
+    assert checks[0].state == "problem"
+    assert "usb-FTDI_tracker" in checks[0].mend  # which there is instead
     (none,) = serial_ports({}, {}, at)
     assert (none.state, none.said) == ("ok", "none is plugged in")
 
@@ -184,6 +184,6 @@ def test_services_and_hosts_that_answer_and_that_do_not():
     assert "answers in" in answers.said
     assert refuses.state == "problem"
     assert "refused" in refuses.said
-    (found,) = reachable("no-such-arm.invalid", {30004: "RTDE"})
-    assert found.state == "problem"
-    assert "is not known" in found.said
+    (unknown,) = reachable("no-such-arm.invalid", {30004: "RTDE"})
+    assert unknown.state == "problem"
+    assert "is not known" in unknown.said

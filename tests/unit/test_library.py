@@ -70,15 +70,15 @@ def test_functions_use_one_thread_of_blas_and_leave_the_callers_limit(site, monk
         return {i["num_threads"] for i in threadpool_info() if i["user_api"] == "blas"}
 
     def fitted(*args, **options):
-        seen.append(threads())
+        counts.append(threads())
         return fit(*args, **options)
 
-    seen, fit = [], library.fits.fit
+    counts, fit = [], library.fits.fit
     monkeypatch.setattr(library.fits, "fit", fitted)
     with hc.Campaign.open(site.run) as run, threadpool_limits(limits=2, user_api="blas"):
         hc.fit(hc.baseline(run), run)
         assert threads() == {2}
-    assert seen == [{1}]
+    assert counts == [{1}]
 
 
 @pytest.fixture(scope="module")
@@ -134,10 +134,10 @@ def test_the_lazy_names_are_those_that_type_checkers_see():
     (checked,) = [
         node for node in tree.body if isinstance(node, ast.If) and isinstance(node.test, ast.Name)
     ]
-    seen = {}
+    imported = {}
     for node in checked.body:
-        seen |= {alias.name: node.module for alias in node.names}
-    assert seen == hc._PLACES
+        imported |= {alias.name: node.module for alias in node.names}
+    assert imported == hc._PLACES
 
 
 def test_an_absent_viewer_is_named(site):
@@ -245,15 +245,15 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
         assert len(fit.residuals) == len(fit.residuals()) > len(fit.residuals[:3]) == 3
         assert fit.residuals.to_frame().equals(fit.to_frame())
         refusal("no revision yet", hc.diagnose, run)
-        found = hc.refine(run)
-        assert found.fit.model.names == refined.fit.model.names
+        refinement = hc.refine(run)
+        assert refinement.fit.model.names == refined.fit.model.names
         assert run.revisions == ()
-        run.append(found)
-        assert [r.number for r in run.revisions] == list(range(1, 1 + len(found.steps)))
-        assert run.revisions[-1].verdict == found.verdict
+        run.append(refinement)
+        assert [r.number for r in run.revisions] == list(range(1, 1 + len(refinement.steps)))
+        assert run.revisions[-1].verdict == refinement.verdict
         assert run.fit(1).model.names == model.names
         assert (model + "creep" - "creep").names == model.names
-        assert hc.diagnose(run).verdict == found.verdict
+        assert hc.diagnose(run).verdict == refinement.verdict
         run.append(hc.fit(model, run, readings="absolute"))
         assert hc.fit(hc.baseline(run), run).mode == hc.refine(run).fit.mode == "absolute"
     assert hc.validate(path, site.later).judged.unseen
@@ -267,7 +267,7 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
 @pytest.mark.long
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined, planned):
     with hc.Campaign.open(site.run, read_only=True) as run:
-        found, fit, judged = refined, refined.fit, refined.diagnosis
+        refinement, fit, judged = refined, refined.fit, refined.diagnosis
         values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, fit.model, fit]
         values += [fit.parameters, fit.predict(run.readings.states), judged, judged.suspects[0]]
         calibration, q = hc.Calibration.of(fit), run.readings.states.q
@@ -278,14 +278,14 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined
         tested, compared = hc.validate(run, run), hc.compare(run, site.later)
         values += [tested, tested.prediction, tested.beyond, tested.shares]
         values += [compared, compared.today, compared.changes]
-        for value in (*values, found, found.steps[0]):
+        for value in (*values, refinement, refinement.steps[0]):
             text = repr(value)
             assert text.count("\n") < 15, text
             assert len(text) < 2500, text
         assert "revision" in repr(run)
         assert judged.verdict in repr(judged)
         assert judged.suspects[0].effect in repr(judged)
-        assert all(step.diagnosis.verdict in repr(found) for step in found.steps)
+        assert all(step.diagnosis.verdict in repr(refinement) for step in refinement.steps)
     with hc.Campaign(site.run, read_only=True) as run:
         pass
     assert "the file is closed" in repr(run)
@@ -311,8 +311,8 @@ def test_results_are_data_frames(site, planned, tmp_path):
         rows = fit.to_frame()
         assert rows["pose"].tolist() == frame["pose"].tolist()
         assert rows["load"].tolist() == frame["load"].tolist()
-        own = rows[["residual_x_m", "residual_y_m", "residual_z_m"]].dropna().to_numpy(float)
-        assert np.linalg.norm(own) == pytest.approx(np.linalg.norm(fit.residuals()[:, :3]))
+        residuals = rows[["residual_x_m", "residual_y_m", "residual_z_m"]].dropna().to_numpy(float)
+        assert np.linalg.norm(residuals) == pytest.approx(np.linalg.norm(fit.residuals()[:, :3]))
         judged = hc.diagnose(fit)
         assert judged.to_frame()["effect"].tolist() == [s.effect for s in judged.suspects]
         assert fit.parameters.to_frame().index.tolist() == [p.name for p in fit.parameters]
@@ -455,5 +455,5 @@ def test_the_calibration_of_a_campaign_is_loaded_by_its_name(site, tmp_path):
     with hc.Campaign.open(path) as run:
         run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
         expected = run.calibration().predict(np.full(6, 0.3), std=False)
-    found = hc.Calibration.load(path).predict(np.full(6, 0.3), std=False)
-    np.testing.assert_allclose(found.position, expected.position, rtol=0, atol=1e-12)
+    predicted = hc.Calibration.load(path).predict(np.full(6, 0.3), std=False)
+    np.testing.assert_allclose(predicted.position, expected.position, rtol=0, atol=1e-12)

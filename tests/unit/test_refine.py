@@ -202,10 +202,10 @@ def test_adding_starts_where_the_fit_stands():
 def test_an_effect_cannot_be_added_twice_nor_without_its_columns_nor_unknown():
     c = campaign(plan_seed=0)
     readings = replace(c.readings, states=replace(c.readings.states, approach=None))
-    found = fitted_model(c.cell, readings, "absolute")
-    refusal("joint_compliance is in the model already", add, found, "joint_compliance")
-    refusal("unknown effect 'gear_wear'", add, found, "gear_wear")
-    refusal("hysteresis needs approach", add, found, "hysteresis")
+    fitted = fitted_model(c.cell, readings, "absolute")
+    refusal("joint_compliance is in the model already", add, fitted, "joint_compliance")
+    refusal("unknown effect 'gear_wear'", add, fitted, "gear_wear")
+    refusal("hysteresis needs approach", add, fitted, "hysteresis")
 
 
 def test_it_starts_from_any_model():

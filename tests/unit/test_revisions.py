@@ -29,8 +29,8 @@ def baseline_fit(r):
     return fitted_model(r.cell, r.readings, r.mode)
 
 
-def record_of(r, found, added=None):
-    return to_record(found, None, added, content_hash(r.readings))
+def record_of(r, fitted, added=None):
+    return to_record(fitted, None, added, content_hash(r.readings))
 
 
 @pytest.mark.parametrize(
@@ -39,22 +39,22 @@ def record_of(r, found, added=None):
 )
 def test_the_same_fit_comes_back(effect, held_out):
     r = rehearsal(effect)
-    found = add(baseline_fit(r), effect)
-    text = to_text(to_record(found, diagnose(found).to_dict(), effect, content_hash(r.readings)))
+    fitted = add(baseline_fit(r), effect)
+    text = to_text(to_record(fitted, diagnose(fitted).to_dict(), effect, content_hash(r.readings)))
     again = restore(from_text(text, 2), r.cell, r.readings)
-    assert again.model.names == found.model.names
-    assert [e.options for e in again.model.effects] == [e.options for e in found.model.effects]
-    np.testing.assert_array_equal(again.solution.prior, found.solution.prior)
-    seen = found.uncertainty.identifiable
-    change = np.abs(again.theta - found.theta)[seen] / found.uncertainty.std[seen]
+    assert again.model.names == fitted.model.names
+    assert [e.options for e in again.model.effects] == [e.options for e in fitted.model.effects]
+    np.testing.assert_array_equal(again.solution.prior, fitted.solution.prior)
+    identifiable = fitted.uncertainty.identifiable
+    change = np.abs(again.theta - fitted.theta)[identifiable] / fitted.uncertainty.std[identifiable]
     assert change.max() < 1e-3
-    assert again.chi2 == pytest.approx(found.chi2, rel=1e-6)
-    assert again.dof == pytest.approx(found.dof, rel=1e-6)
+    assert again.chi2 == pytest.approx(fitted.chi2, rel=1e-6)
+    assert again.dof == pytest.approx(fitted.dof, rel=1e-6)
     # The rank is analysed again at the converged parameters. Directions that are hardly determined
     # (0.27 σ per ordinary magnitude for link_geometry) turn a little: 6e-5 of the held-out error.
-    assert again.holdout.rms_m == pytest.approx(found.holdout.rms_m, rel=held_out)
+    assert again.holdout.rms_m == pytest.approx(fitted.holdout.rms_m, rel=held_out)
     assert again.solution.iterations <= 2
-    np.testing.assert_array_equal(again.outlier, found.outlier)
+    np.testing.assert_array_equal(again.outlier, fitted.outlier)
 
 
 def test_a_gross_error_stays_set_aside():
@@ -62,25 +62,25 @@ def test_a_gross_error_stays_set_aside():
     value = r.readings.value.copy()
     value[17] += 0.004
     readings = replace(r.readings, value=value)
-    found = fitted_model(r.cell, readings, "absolute")
-    assert np.flatnonzero(found.outlier).tolist() == [17]
-    record = to_record(found, None, None, content_hash(readings))
+    fitted = fitted_model(r.cell, readings, "absolute")
+    assert np.flatnonzero(fitted.outlier).tolist() == [17]
+    record = to_record(fitted, None, None, content_hash(readings))
     assert record.parameters_json["outliers"] == [17]
     again = restore(record, r.cell, readings)
-    np.testing.assert_array_equal(again.outlier, found.outlier)
-    (gross,) = to_json(found)["outliers"]
+    np.testing.assert_array_equal(again.outlier, fitted.outlier)
+    (gross,) = to_json(fitted)["outliers"]
     assert gross["pose"] == readings.pose_names[readings.pose[17]]
     assert gross["sigma"] > 50
 
 
 def test_other_readings_are_refused(tmp_path):
     r = rehearsal("nothing")
-    found = baseline_fit(r)
-    record = record_of(r, found)
+    fitted = baseline_fit(r)
+    record = record_of(r, fitted)
     refusal("identify again", restore, record, r.cell, r.readings[:-1])
     moved = replace(r.readings, value=r.readings.value + 1e-6)
     with Campaign.open(stored_readings(tmp_path / "run.hilcal", moved, r.config)) as run:
-        refusal("other readings", run.append, found)
+        refusal("other readings", run.append, fitted)
         assert run.latest() is None
 
 
@@ -135,10 +135,10 @@ def test_a_prior_that_no_fit_can_have_had_is_damage(wide):
 
 def test_the_registration_that_is_reported_is_the_true_one():
     r = rehearsal("nothing", poses=30)
-    found = baseline_fit(r)
-    away = np.linalg.inv(r.world.registration) @ found.frames.base
+    fitted = baseline_fit(r)
+    away = np.linalg.inv(r.world.registration) @ fitted.frames.base
     np.testing.assert_allclose(away, np.eye(4), atol=3e-5)
-    assert not np.allclose(found.model.cell.registration, r.world.registration, atol=3e-5)
+    assert not np.allclose(fitted.model.cell.registration, r.world.registration, atol=3e-5)
 
 
 def test_a_chain_starts_at_its_first_model():
