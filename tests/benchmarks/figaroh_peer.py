@@ -76,12 +76,12 @@ def fitted(robot, method, task, base):
     table[["x1", "y1", "z1"]] = (np.array(task["value"]) - base.translation) @ base.rotation
     table.to_csv(READINGS, index=False)
     start = time.process_time()
-    found = Calibration(robot, CONFIG)
-    found.calib_config.update(known_baseframe=elastic, known_tipframe=False)
-    found.initialize()
-    result = found.solve(enable_logging=False)
+    calibration = Calibration(robot, CONFIG)
+    calibration.calib_config.update(known_baseframe=elastic, known_tipframe=False)
+    calibration.initialize()
+    result = calibration.solve(enable_logging=False)
     seconds = time.process_time() - start
-    config = {**found.calib_config, "NbSample": len(task["fresh"])}
+    config = {**calibration.calib_config, "NbSample": len(task["fresh"])}
     fresh = calc_updated_fkm(robot.model, robot.data, result.x, np.array(task["fresh"]), config)
     fresh = fresh.reshape(3, -1).T @ base.rotation.T + base.translation
     done = {"seconds": seconds, "parameters": len(result.x), "fresh": fresh.tolist()}
@@ -112,17 +112,19 @@ def planned(robot, task):
         "calibration_joint_configurations": task["candidates"],
     }
     Path(CANDIDATES).write_text(yaml.safe_dump(content), encoding="utf-8")
-    found = BaseOptimalCalibration(robot, CONFIG)
-    found.initialize()
+    calibration = BaseOptimalCalibration(robot, CONFIG)
+    calibration.initialize()
     start = time.process_time()
-    found.calculate_optimal_configurations()
+    calibration.calculate_optimal_configurations()
     relaxed = time.process_time() - start
     random.seed(0)
     start = time.process_time()
-    history = Detmax(found._subX_dict, task["poses"]).main_algo()  # it keeps no list of the poses
+    history = Detmax(
+        calibration._subX_dict, task["poses"]
+    ).main_algo()  # it keeps no list of the poses
     return {
-        "rows": found.R_rearr.reshape(len(task["candidates"]), 3, -1).tolist(),
-        "weights": found.w_list,
+        "rows": calibration.R_rearr.reshape(len(task["candidates"]), 3, -1).tolist(),
+        "weights": calibration.w_list,
         "relaxed_seconds": relaxed,
         "exchanged": history[-1],
         "exchange_seconds": time.process_time() - start,

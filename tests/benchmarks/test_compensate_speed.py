@@ -42,8 +42,10 @@ def test_compensation(effect, benchmark, claim):
     recorded = {k: v[rows] for k, v in columns.items() if v is not None}
     first = {k: v[0] for k, v in recorded.items()}
     assert calibration.without_kernel() == ()
-    found = calibration.compensate(q, wrench, recorded=recorded)  # the kernel is compiled here
-    assert found.inverse.solved.mean() > 0.95
+    compensation = calibration.compensate(
+        q, wrench, recorded=recorded
+    )  # the kernel is compiled here
+    assert compensation.inverse.solved.mean() > 0.95
     one = shortest(lambda: calibration.compensate(q[0], wrench[0], recorded=first), 500)
     many = shortest(lambda: calibration.compensate(q, wrench, recorded=recorded))
     chain = shortest(lambda: evaluate(calibration.model.cell.arm, q))

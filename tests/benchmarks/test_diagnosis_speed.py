@@ -44,14 +44,14 @@ def score(found):
 @pytest.mark.parametrize("readings", [180, 1000])
 def test_scoring_against_a_fit_of_the_largest_model(readings, mode, benchmark, claim):
     """`ratio`: scoring the catalogue over one fit of the largest model; `diagnose_s`: all of it."""
-    found = based(campaign("hysteresis", mode, poses=readings // LOADS, strength=2.0))
-    assert len(found.readings) == readings
-    model = largest(found)
+    fitted = based(campaign("hysteresis", mode, poses=readings // LOADS, strength=2.0))
+    assert len(fitted.readings) == readings
+    model = largest(fitted)
     seconds = shortest(
         {
-            "fit": lambda: fit(model, found.readings, mode),
-            "scoring": lambda: score(found),
-            "diagnose": lambda: diagnose(found),
+            "fit": lambda: fit(model, fitted.readings, mode),
+            "scoring": lambda: score(fitted),
+            "diagnose": lambda: diagnose(fitted),
         },
         ROUNDS,
     )
@@ -66,7 +66,7 @@ def test_scoring_against_a_fit_of_the_largest_model(readings, mode, benchmark, c
     claim(f"{what}: the whole diagnosis over {one}", f"{whole:.2f}", "no limit")
     aim = "aim: 1 of 1000 readings"
     claim(f"{what}: the whole diagnosis, s", f"{seconds['diagnose']:.2f}", aim)
-    suspects = benchmark.pedantic(score, args=(found,), rounds=1)
+    suspects = benchmark.pedantic(score, args=(fitted,), rounds=1)
     assert "hysteresis" in {s.effect for s in suspects}
 
 
@@ -74,10 +74,10 @@ def test_scoring_against_a_fit_of_the_largest_model(readings, mode, benchmark, c
 def test_diagnosing_what_nothing_explains(mode, benchmark, claim):
     """`diagnose_s`: with smooth laws of the residual, which a good suspect spares."""
     c = campaign("none", mode, poses=1000 // LOADS)
-    found = based(replace(c, readings=replace(c.readings, covariance=c.readings.covariance / 4)))
-    seconds = shortest({"diagnose": lambda: diagnose(found)}, ROUNDS)["diagnose"]
+    fitted = based(replace(c, readings=replace(c.readings, covariance=c.readings.covariance / 4)))
+    seconds = shortest({"diagnose": lambda: diagnose(fitted)}, ROUNDS)["diagnose"]
     benchmark.extra_info["diagnose_s"] = seconds
     what = f"1000 {mode} readings of twice the stated noise: the whole diagnosis, s"
     claim(what, f"{seconds:.2f}", "aim: 1")
-    diagnosis = benchmark.pedantic(diagnose, args=(found,), rounds=1)
+    diagnosis = benchmark.pedantic(diagnose, args=(fitted,), rounds=1)
     assert diagnosis.verdict == "noise_misjudged"

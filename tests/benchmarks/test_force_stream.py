@@ -55,13 +55,13 @@ def read_for(seconds, port):
 @pytest.mark.slow
 def test_one_kilohertz_for_a_minute(benchmark, claim):
     with force_sensor("bota") as simulated:
-        found = benchmark.pedantic(read_for, (SECONDS, simulated.port), rounds=1, iterations=1)
+        result = benchmark.pedantic(read_for, (SECONDS, simulated.port), rounds=1, iterations=1)
         assert simulated.admin("state")["dropped"] == simulated.admin("state")["lost"] == 0
-    share = found["cpu"] / found["wall"]
+    share = result["cpu"] / result["wall"]
     benchmark.extra_info["core share"] = round(share, 4)
-    benchmark.extra_info["frames"] = found["frames"]
+    benchmark.extra_info["frames"] = result["frames"]
     claim("force stream of 1 kHz: share of a core", f"{share:.3f}", f"at most {CORE_SHARE:g}")
-    lost = found["lost"] + found["corrupt"] + found["skipped"]
+    lost = result["lost"] + result["corrupt"] + result["skipped"]
     claim(f"force stream of 1 kHz for {SECONDS:.0f} s: frames lost", f"{lost}", "0")
-    assert found["lost"] == found["corrupt"] == found["skipped"] == 0
-    assert found["frames"] == pytest.approx(1000 * found["wall"], abs=100)
+    assert result["lost"] == result["corrupt"] == result["skipped"] == 0
+    assert result["frames"] == pytest.approx(1000 * result["wall"], abs=100)

@@ -20,8 +20,8 @@ def test_a_sample_with_a_load_and_obstacles(benchmark, claim):
     config = bench.config.model_copy(update={"obstacles": (Obstacle(**TABLE),)})
     guard = Guard(bench.cell.with_config(config))
     sample = replace(bench.rig.arm.sample(), q=np.array(POSES["p1"]))
-    found = benchmark(guard.check, sample, np.zeros(6), "3kg")
-    assert found is None
+    result = benchmark(guard.check, sample, np.zeros(6), "3kg")
+    assert result is None
     if benchmark.stats is not None:
         seconds = benchmark.stats.stats.median
         claim(

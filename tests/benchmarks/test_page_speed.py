@@ -64,8 +64,8 @@ def test_until_the_page_can_be_used(content, tmp_path, benchmark, claim):
 
 def work_of(client):
     """Processor time of the page's main thread, ms."""
-    found = client.send("Performance.getMetrics")["metrics"]
-    return next(1e3 * m["value"] for m in found if m["name"] == "TaskDuration")
+    metrics = client.send("Performance.getMetrics")["metrics"]
+    return next(1e3 * m["value"] for m in metrics if m["name"] == "TaskDuration")
 
 
 def test_recording_of_ten_thousand_readings(tmp_path, benchmark, claim):

@@ -54,8 +54,8 @@ GEOMETRY = ("link_geometry", "joint_compliance")
 def timed(work):
     """Return what some work gives, and its processor time, s."""
     start = time.process_time()
-    found = work()
-    return found, time.process_time() - start
+    result = work()
+    return result, time.process_time() - start
 
 
 def by_figaroh(benchmark, folder, arm, task):
@@ -192,9 +192,9 @@ def test_calibration(benchmark, claim, tmp_path, kind, request):
     }
     table = []
     for who, work in works.items():
-        found, seconds = timed(work)
-        predicted = found.predict(states).position
-        table.append(_judged(who, seconds, found.model.size, predicted, truth))
+        result, seconds = timed(work)
+        predicted = result.predict(states).position
+        table.append(_judged(who, seconds, result.model.size, predicted, truth))
     for who, made in done.items():
         table.append(_judged(who, made["seconds"], made["parameters"], made["fresh"], truth))
     benchmark.pedantic(geometry, rounds=1)
@@ -249,12 +249,12 @@ def test_least_squares(benchmark, claim):
 
         begin, jacobian = np.zeros(basis.shape[1]), slope if exact else "2-point"
         search = partial(so.least_squares, off, begin, jacobian, method=method)
-        found, seconds = timed(search)
-        theta = basis @ found.x
-        figures = {"steps": found.nfev, "χ²": 2 * found.cost, ERROR: error(theta)}
+        result, seconds = timed(search)
+        theta = basis @ result.x
+        figures = {"steps": result.nfev, "χ²": 2 * result.cost, ERROR: error(theta)}
         table.append(Row(f"SciPy: {name}", seconds, figures))
         if basis is solution.transform:
-            assert 2 * found.cost == pytest.approx(least, rel=1e-4)
+            assert 2 * result.cost == pytest.approx(least, rel=1e-4)
     what = f"{len(readings)} positions, {solution.transform.shape[1]} of {model.size} coordinates"
     record(benchmark, claim, "least squares", what, table)
 
@@ -279,8 +279,8 @@ def test_cross_validation(benchmark, claim):
     benchmark.pedantic(_left_out, args=(model, c.readings, states), rounds=1)
     names = {"hilcal": "hilcal: poses left out", "mrcal": "mrcal's method: two halves"}
     table = []
-    for who, found in rows.items():
-        right, wrong = (np.array(found[e]) for e in (campaigns.NO_EFFECT, "transmission_error"))
+    for who, value in rows.items():
+        right, wrong = (np.array(value[e]) for e in (campaigns.NO_EFFECT, "transmission_error"))
         figures = {
             "model right": float(np.median(right)),
             "largest": float(right.max()),
@@ -304,11 +304,11 @@ def _halves(model, readings, states):
     """Return the rms difference of two halves' predictions, in units of its standard deviation."""
     predictions, spread = [], np.zeros((len(states), 3, 3))
     for half in (0, 1):
-        found = fit(model, readings[readings.pose % 2 == half], "absolute").solution
-        root = found.transform @ found.equations.inverse_root(found.beta).T
-        prediction = model.predict(states, found.theta)
+        solution = fit(model, readings[readings.pose % 2 == half], "absolute").solution
+        root = solution.transform @ solution.equations.inverse_root(solution.beta).T
+        prediction = model.predict(states, solution.theta)
         predictions.append(prediction.observation.position)
-        jacobian = model.jacobian(prediction, found.theta, 3) @ root
+        jacobian = model.jacobian(prediction, solution.theta, 3) @ root
         spread += jacobian @ np.swapaxes(jacobian, 1, 2)
     off = predictions[0] - predictions[1]
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)

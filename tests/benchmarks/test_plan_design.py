@@ -105,15 +105,15 @@ def test_peer_problem(benchmark, claim, kind):
     units = CandidateSet(units.rows[:300], units.cost[:300])
     works = {"relax": lambda: relax(by_volume(units), 1.0), "scan": lambda: leverage(units)}
     seconds, scan = shortest(works, 5).values()
-    found = relax(by_volume(units), 1.0)
+    relaxed = relax(by_volume(units), 1.0)
     reference = float(np.exp(multiplicative(units, 5000) / 24))
-    benchmark.extra_info["gap"] = found.gap
-    benchmark.extra_info["against_multiplicative"] = found.value / reference
+    benchmark.extra_info["gap"] = relaxed.gap
+    benchmark.extra_info["against_multiplicative"] = relaxed.value / reference
     what = f"{kind}: 300 poses, 24 parameters"
-    claim(f"{what}: gap of the continuous optimum", f"{found.gap:.1e}", "at most 1e-6")
-    over = f"{found.value / reference:.9f}"
+    claim(f"{what}: gap of the continuous optimum", f"{relaxed.gap:.1e}", "at most 1e-6")
+    over = f"{relaxed.value / reference:.9f}"
     claim(f"{what}: value over that of 5000 multiplicative steps", over, "at least 1 - 1e-6")
     claim(f"{what}: time over that of one scan", f"{seconds / scan:.0f}", "no limit")
     benchmark(relax, by_volume(units), 1.0)
-    assert found.gap <= 1e-6
-    assert found.value >= reference * (1 - 1e-6)
+    assert relaxed.gap <= 1e-6
+    assert relaxed.value >= reference * (1 - 1e-6)

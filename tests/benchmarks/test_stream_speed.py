@@ -96,7 +96,7 @@ def test_a_stream_against_reading_and_multiplying(benchmark, claim, tmp_path, mo
         with monkeypatch.context() as patch:
             patch.setattr(passes, "Triangle", Product)
             times.setdefault("whole multiply", []).append(seconds(lambda: the_whole(work, theta)))
-    best = {name: min(found) for name, found in times.items()}
+    best = {name: min(value) for name, value in times.items()}
     given = best["multiply"] / best["reduce"]
     size = f"{READINGS} 3-D readings x {PARAMETERS} parameters"
     claim(f"stream, rows given, {size}: rate over reading and AᵀA", f"{given:.2f}", LIMIT)

@@ -65,8 +65,8 @@ def turned(viewer):
 
 def dragged(viewer, timeline):
     """Drag the time along the second half of a recording, again and again."""
-    found = [t for r in viewer.get_state().recordings for t in r.timelines if t.name == timeline]
-    start, end = float(found[0].start), float(found[0].end)
+    selected = [t for r in viewer.get_state().recordings for t in r.timelines if t.name == timeline]
+    start, end = float(selected[0].start), float(selected[0].end)
     while True:
         for k in range(PICTURES):
             at = start + (end - start) * (0.5 + 0.5 * k / PICTURES)

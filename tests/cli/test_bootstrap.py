@@ -40,16 +40,16 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys
     assert "no revision yet" in refused(capsys, 2, "identify", new, "--prior", old)
     ok(capsys, "identify", old)
     alone = ok(capsys, "identify", new, "--json").document
-    found = ok(capsys, "identify", new, "--prior", old, "--json").document
-    source, first = found["prior"]["source"], found["prior"]["effects"][0]
+    document = ok(capsys, "identify", new, "--prior", old, "--json").document
+    source, first = document["prior"]["source"], document["prior"]["effects"][0]
     assert (source["campaign"], source["revision"]) == ("old.hilcal", 1)
     assert {"effect", "joint", "moved_sigma", "p_value", "drift"} <= set(first)
     name = "joint_compliance.j2"
-    std = [next(p["std"] for p in d["parameters"] if p["name"] == name) for d in (alone, found)]
+    std = [next(p["std"] for p in d["parameters"] if p["name"] == name) for d in (alone, document)]
     assert std[1] < std[0]  # the two simulated arms differ: some of it drifted
     old.unlink()  # later commands find the prior in the file
     d = ok(capsys, "compare", new, "--json").document
-    assert d["variance_factor"] == pytest.approx(found["variance_factor"], rel=1e-6)
+    assert d["variance_factor"] == pytest.approx(document["variance_factor"], rel=1e-6)
 
 
 def imported_readings(readings, folder, capsys):
@@ -64,7 +64,7 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
     readings = rehearsal("nothing").readings
     value = readings.value.copy()
     value[7] += [4e-3, 0.0, 3e-3]
-    found = {}
+    by_key = {}
     for name, r in (("good", readings), ("off", replace(readings, value=value))):
         folder = tmp_path / name
         folder.mkdir()
@@ -72,11 +72,11 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
         d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
         with hc.Campaign.open(run, read_only=True) as opened:
             q = opened.readings.states.q[::7] + 0.01
-            found[name] = d["error"], opened.calibration().predict(q).band_m
+            by_key[name] = d["error"], opened.calibration().predict(q).band_m
     assert len(d["outliers"]) == 1
     said = " ".join(ok(capsys, "compare", run).out.split())
     assert "Gross errors may be listed here; the figures above do not include them: p" in said
-    (good, band), (off, its) = found.values()
+    (good, band), (off, its) = by_key.values()
     for key in ("before", "fit", "holdout"):
         assert off[key]["rms_m"] == pytest.approx(good[key]["rms_m"], rel=0.1)
         assert off[key]["max_m"] < 4e-3

@@ -93,9 +93,9 @@ def test_what_fits_do_not_know_of_a_changed_cell_is_said(there, capsys):
     text = path.with_name("cell.toml").read_text(encoding="utf-8")
     cell = path.with_name("changed.toml")
     cell.write_text(text + "[tracker]\nrange_std_m = 2e-5\n", encoding="utf-8")
-    found = ok(capsys, "calibrate", cell, "-o", path, "--resume")
+    result = ok(capsys, "calibrate", cell, "-o", path, "--resume")
     said = f"note: [tracker] range_std_m is 2e-05, and was 5e-06 when {path} was begun"
-    assert said in " ".join(found.err.split())
+    assert said in " ".join(result.err.split())
 
 
 def test_a_limit_is_judged_by_what_was_measured(there, capsys):
@@ -108,9 +108,9 @@ def test_a_limit_is_judged_by_what_was_measured(there, capsys):
     noise = ok(capsys, *command, "--limit", "1 mm", "--json").document["improvement"]["error"]
     between = 0.5e6 * (noise["noise_m"] + noise["after"]["max_m"])
     if noise["after"]["max_m"] > noise["noise_m"]:
-        found = run(capsys, *command, "--limit", f"{between:.2f} um")
-        assert found.code == 5
-        assert "are over the limit of" in found.err
+        result = run(capsys, *command, "--limit", f"{between:.2f} um")
+        assert result.code == 5
+        assert "are over the limit of" in result.err
 
 
 def test_what_fits_refuses_a_validation_campaign(there, capsys):
@@ -240,21 +240,21 @@ def test_a_random_cell_is_calibrated_to_an_end(seed, tmp_path, capsys):
     cell = tmp_path / "CELL.toml"
     cell.write_text(tomli_w.dumps(random_cell(rng)), encoding="utf-8")
     options = (*random_options(rng), *SMALL)
-    found = rehearsed(capsys, cell, *options)
-    if "or leave out --goal" in found.err:  # of the position, which deflections do not show
-        assert found.code == 2
+    result = rehearsed(capsys, cell, *options)
+    if "or leave out --goal" in result.err:  # of the position, which deflections do not show
+        assert result.code == 2
         k = options.index("--goal")
         options = (*options[:k], *options[k + 2 :])
-        found = rehearsed(capsys, cell, *options)
-    assert found.code in ENDS, found.err
-    document = json.loads(found.out)
-    assert ("error" in document) == bool(found.code)
-    if found.code != 4:
+        result = rehearsed(capsys, cell, *options)
+    assert result.code in ENDS, result.err
+    document = json.loads(result.out)
+    assert ("error" in document) == bool(result.code)
+    if result.code != 4:
         assert document["improvement"]
-        steps_are_taken(capsys, found, cell.with_name("run.hilcal"))
+        steps_are_taken(capsys, result, cell.with_name("run.hilcal"))
         again = run(capsys, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--resume",
                     *options)  # fmt: skip
-        assert again.code == found.code
+        assert again.code == result.code
         assert json.loads(again.out)["improvement"] == document["improvement"]
 
 
@@ -277,7 +277,7 @@ def rehearsed(capsys, cell, *options):
     path = cell.with_name("run.hilcal")
     for _ in range(TRIES):
         resume = ("--resume",) if path.exists() else ()
-        found = run(capsys, "calibrate", cell, "-o", path, *resume, *options)
-        if found.code != 3 or not STARVED.search(found.err):
+        result = run(capsys, "calibrate", cell, "-o", path, *resume, *options)
+        if result.code != 3 or not STARVED.search(result.err):
             break
-    return found
+    return result

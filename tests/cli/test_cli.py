@@ -71,7 +71,7 @@ def test_all_scalings_stand_side_by_side(campaign, capsys):
     d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document
     assert d["scaling"] == "gc"
     assert set(d["scalings"]) == {"none", "gu", "gc"}
-    assert all(found["scaling"] == name for name, found in d["scalings"].items())
+    assert all(value["scaling"] == name for name, value in d["scalings"].items())
     assert d["scalings"]["gc"]["parameters"] == d["parameters"]
     assert d["scalings"]["none"]["parameters"] != d["parameters"]
     with CampaignFile.open(campaign) as stored:

@@ -20,16 +20,16 @@ def revisions(path):
 
 def test_identify_takes_options_and_keeps_them(campaign, tmp_path, capsys):
     text = "joint_compliance(joints=1/2/3/4-6), hysteresis(joints=1-3), transmission_error(harmonics=5; joints='2/3')"  # noqa: E501
-    found = ok(capsys, "identify", campaign, "--effects", text, "--json")
-    d = found.document
+    result = ok(capsys, "identify", campaign, "--effects", text, "--json")
+    d = result.document
     assert d["model"] == ["base_frame", "joint_compliance", "hysteresis", "transmission_error"]
     assert d["options"]["joint_compliance"] == {"joints": "1/2/3/4-6"}
     assert d["options"]["hysteresis"] == {"joints": "1-3"}
     assert d["options"]["transmission_error"] == {"harmonics": 5, "joints": "2/3"}
-    assert names_of(found, "joint_compliance") == ["j1", "j2", "j3", "j4-6"]
-    assert names_of(found, "hysteresis") == ["j1-3"]
+    assert names_of(result, "joint_compliance") == ["j1", "j2", "j3", "j4-6"]
+    assert names_of(result, "hysteresis") == ["j1-3"]
     said = "hysteresis(joints=1-3), transmission_error(harmonics=5, joints=2/3)."
-    assert said in " ".join(found.err.split())
+    assert said in " ".join(result.err.split())
     ((effects, added, options),) = revisions(campaign)
     assert added is None
     assert {e: options[e] for e in effects} == d["options"]

@@ -203,9 +203,9 @@ def campaign(tmp_path_factory):
 def test_a_campaign_that_nothing_was_fitted_to_has_a_page_of_the_baseline(campaign, capsys):
     before = campaign.read_bytes()
     options = ("--limit", "0.001 um", "--operator", "A. Miller")
-    found = ok(capsys, "report", campaign, *options, "--json")
+    result = ok(capsys, "report", campaign, *options, "--json")
     page = campaign.with_suffix(".html")
-    document = found.document
+    document = result.document
     assert document["report"] == str(page)
     assert document["bytes"] == page.stat().st_size
     assert document["passed"] is False
@@ -227,8 +227,8 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaig
     readings = measured(worn, loads, 4, np.random.default_rng(8))
     later = stored_readings(campaign.with_name("later.hilcal"), readings, config)
     page = campaign.with_name("both.html")
-    found = ok(capsys, "report", campaign, later, "-o", page, "--json").document
-    assert found["headline"] == "Something has changed: joint 2"
+    document = ok(capsys, "report", campaign, later, "-o", page, "--json").document
+    assert document["headline"] == "Something has changed: joint 2"
     text = page.read_text(encoding="utf-8")
     for file in (campaign, later):
         assert hashlib.sha256(file.read_bytes()).hexdigest() in text

@@ -335,14 +335,14 @@ def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, 
     points.write_text("\n".join(lines + [",".join(f"{v:.12g}" for v in r) for r in rows]))
     words = ok(capsys, "compensate", fitted, points, "--load", "10kg").out
     assert " ".join(shown.split()) in " ".join(words.split())
-    found = ok(capsys, "compensate", fitted, points, "--load", "10kg", "--json").document
-    assert found["base_in_tracker"] == frames["base_in_tracker"]
-    assert found["base_is"] == frames["base_is"] == "mechanical"
-    corrected = np.array([p["q_corrected"] for p in found["points"]])
+    document = ok(capsys, "compensate", fitted, points, "--load", "10kg", "--json").document
+    assert document["base_in_tracker"] == frames["base_in_tracker"]
+    assert document["base_is"] == frames["base_is"] == "mechanical"
+    corrected = np.array([p["q_corrected"] for p in document["points"]])
     read = world.ideal_readings(States(corrected, np.tile(load, (len(q), 1)))).value(3)
     off = np.linalg.norm((read - base[:3, 3]) @ base[:3, :3] - asked[:, :3, 3], axis=1)
-    assert np.all(off <= [p["band_m"] for p in found["points"]])
-    assert found["error_before"]["mean_m"] > 20 * off.mean()
+    assert np.all(off <= [p["band_m"] for p in document["points"]])
+    assert document["error_before"]["mean_m"] > 20 * off.mean()
     report = tmp_path / "r.html"
     ok(capsys, "report", fitted, "-o", report)
     assert "the nominal arm on it has the axis of joint 1" in report.read_text()

@@ -151,7 +151,7 @@ def pose(values):
 def points(path):
     """Points of a .dat file, as other eyes have them."""
     text = path.read_bytes().decode("latin-1")
-    found = re.findall(
+    matches = re.findall(
         r"E6POS (\w+)=\{X (\S+?),Y (\S+?),Z (\S+?),A (\S+?),B (\S+?),C (\S+?),", text
     )
-    return {name: pose([float(v) for v in values]) for name, *values in found}
+    return {name: pose([float(v) for v in values]) for name, *values in matches}

@@ -42,11 +42,11 @@ def campaign(tmp_path_factory):
 
 def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(campaign, tmp_path, capsys):
     out = tmp_path / "found.py"
-    found = run(capsys, "discover", campaign, "-o", out, "--json")
-    assert found.code == 4
-    assert found.document["laws"] == []
-    assert found.document["reason"] == "adequate"
-    assert "nothing to explain" in found.err
+    outcome = run(capsys, "discover", campaign, "-o", out, "--json")
+    assert outcome.code == 4
+    assert outcome.document["laws"] == []
+    assert outcome.document["reason"] == "adequate"
+    assert "nothing to explain" in outcome.err
     assert not out.exists()
 
 
@@ -74,16 +74,16 @@ def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monk
     monkeypatch.setattr("hilcal.cli.refining.search", search)
     out = tmp_path / "bent.py"
     asked = ("-o", out, "--against", "joint_compliance", "--json")
-    found = ok(capsys, "discover", campaign, *asked, "--alternatives")
+    result = ok(capsys, "discover", campaign, *asked, "--alternatives")
     other = tmp_path / "bent_or_1.py"
-    assert found.document["alternatives"] == [{"name": "bent_or_1", "written": str(other)}]
-    assert found.document["laws"][0]["alternatives"] == ["dq_3 = a·cos(q_5)·τ_3"]
-    assert [x["probability"] for x in found.document["structures"]] == [0.7, 0.2, 0.01]
-    assert [x["pareto"] for x in found.document["structures"]] == [True, False, False]
-    assert "best of its size" in found.err
-    assert "Averaged by their probability" in found.err
-    assert found.document["average"]["std_m"] > 0
-    assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
+    assert result.document["alternatives"] == [{"name": "bent_or_1", "written": str(other)}]
+    assert result.document["laws"][0]["alternatives"] == ["dq_3 = a·cos(q_5)·τ_3"]
+    assert [x["probability"] for x in result.document["structures"]] == [0.7, 0.2, 0.01]
+    assert [x["pareto"] for x in result.document["structures"]] == [True, False, False]
+    assert "best of its size" in result.err
+    assert "Averaged by their probability" in result.err
+    assert result.document["average"]["std_m"] > 0
+    assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in result.err
     files = ("--effects-from", out, "--effects-from", other)
     plan = ("-o", tmp_path / "plan.json", "--suspects", "bent,bent_or_1", *files, "--quick")
     absolute = tmp_path / "absolute.hilcal"
@@ -100,24 +100,24 @@ def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monk
     ok(capsys, "export", creeping, "--calibration", calibration)
     listed[0] = 1
     for model, names in (("baseline", BASELINE), (calibration, [*BASELINE, "creep"])):
-        found = ok(capsys, "discover", campaign, "-o", out, "--against", model, "--json")
-        assert found.document["model"] == names
-    found = ok(capsys, "discover", campaign, *asked)
-    assert found.document["alternatives"] == []
+        result = ok(capsys, "discover", campaign, "-o", out, "--against", model, "--json")
+        assert result.document["model"] == names
+    result = ok(capsys, "discover", campaign, *asked)
+    assert result.document["alternatives"] == []
     assert not other.exists()
-    assert found.document["written"] == str(out)
-    assert found.document["laws"][0]["formula"] == "dq_2 = a"
+    assert result.document["written"] == str(out)
+    assert result.document["laws"][0]["formula"] == "dq_2 = a"
     assert [kind.name for kind in read_effects(out).effects] == ["bent"]
     # the commands that are told work in the searched revision, and know its own effects
     user_file = tmp_path / "mine.py"
     user_file.write_text(source_of_form(hardly, "mine", law.parameters), encoding="utf-8")
     known = ("--effects-from", user_file)
     ok(capsys, "identify", creeping, "--effects", "joint_compliance, mine", *known)
-    found = ok(capsys, "discover", creeping, "-o", out, "--revision", "2", *known, "--json")
+    result = ok(capsys, "discover", creeping, "-o", out, "--revision", "2", *known, "--json")
     expected_text = (
         f"hilcal add {creeping} bent --revision 2 --effects-from {user_file} --effects-from {out}"
     )
-    assert expected_text in " ".join(found.err.split())
+    assert expected_text in " ".join(result.err.split())
 
 
 def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path, capsys):
@@ -197,14 +197,14 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula,
     write_table(
         replace(readings, value=readings.value + moved), tmp_path / "t.csv", INSTRUMENT_AND_ARM
     )
-    toml, campaign, found = (tmp_path / name for name in ("c.toml", "run.hilcal", "found.py"))
+    toml, campaign, law_file = (tmp_path / name for name in ("c.toml", "run.hilcal", "found.py"))
     toml.write_text(to_toml(config), encoding="utf-8")
     ok(capsys, "import", tmp_path / "t.csv", "--config", toml, "-o", campaign)
     before = ok(capsys, "diagnose", campaign, "--json").document
     assert before["verdict"] == "unknown_effect"
-    laws = ok(capsys, "discover", campaign, "-o", found, "--json").document["laws"]
+    laws = ok(capsys, "discover", campaign, "-o", law_file, "--json").document["laws"]
     assert re.search(formula, laws[0]["formula"])
-    check_effect(read_effects(found).effects[0])
-    added = ok(capsys, "add", campaign, "found", "--effects-from", found, "--json").document
+    check_effect(read_effects(law_file).effects[0])
+    added = ok(capsys, "add", campaign, "found", "--effects-from", law_file, "--json").document
     assert added["verdict"] == "adequate"
     assert added["revisions"][-1]["variance_factor"] < 0.4 * before["variance_factor"]

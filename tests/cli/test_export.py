@@ -98,20 +98,20 @@ def test_other_programs_find_units_and_origin(capsys, fitted, tmp_path):
     assert schema.field("q1_rad").metadata == {b"unit": b"rad"}
     assert schema.field("cov_x_x").metadata == {b"unit": b"m2"}
     with hc.Campaign.open(fitted, read_only=True) as run:
-        found, n = run.fit(), len(run.readings)
+        fit_result, n = run.fit(), len(run.readings)
         about = json.loads(schema.metadata[b"hilcal"])
         assert about["readings_sha256"] == run.file.data_hash()
     rows = parquet.read_table(residuals).to_pydict()
     assert len(rows["pose"]) == n
     axes = ("x_m", "y_m", "z_m")
     for what, values in (
-        ("residual", found.raw),
-        ("residual_base", found.residuals("base")),
-        ("left_out", found.left_out),
+        ("residual", fit_result.raw),
+        ("residual_base", fit_result.residuals("base")),
+        ("left_out", fit_result.left_out),
     ):
         np.testing.assert_array_equal(np.array([rows[f"{what}_{a}"] for a in axes]).T, values)
     (row,) = parquet.read_table(revisions).to_pylist()
-    assert row["holdout_mean_m"] == pytest.approx(found.holdout.mean_m, rel=1e-4)
+    assert row["holdout_mean_m"] == pytest.approx(fit_result.holdout.mean_m, rel=1e-4)
     assert row["model"].endswith("encoder_offset")
 
 
@@ -131,16 +131,16 @@ def test_parameters_have_their_covariance(capsys, fitted, tmp_path):
     ok(capsys, "export", fitted, "--parameters", tmp_path / "p.json")
     p = read(tmp_path / "p.json")
     with hc.Campaign.open(fitted, read_only=True) as run:
-        found = run.fit()
-    np.testing.assert_array_equal(p.value, found.theta)
+        fit_result = run.fit()
+    np.testing.assert_array_equal(p.value, fit_result.theta)
     known = p.identifiable
-    np.testing.assert_array_equal(p.std[known], found.uncertainty.std[known])
-    np.testing.assert_array_equal(p.covariance, covariance_of(found))
+    np.testing.assert_array_equal(p.std[known], fit_result.uncertainty.std[known])
+    np.testing.assert_array_equal(p.covariance, covariance_of(fit_result))
     assert np.isnan(p.covariance[~known]).all()
     c = p.covariance[np.ix_(known, known)]
     np.testing.assert_allclose(np.diag(c), p.std[known] ** 2, rtol=1e-12)
     assert np.linalg.eigvalsh(c / np.outer(p.std[known], p.std[known])).min() > -1e-9
-    assert [row.name for row in found.parameters] == list(p.names)
+    assert [row.name for row in fit_result.parameters] == list(p.names)
 
 
 def test_the_corrected_table_is_a_robot_again(capsys, fitted, tmp_path):

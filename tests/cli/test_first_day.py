@@ -85,27 +85,27 @@ class Said:
     @property
     def steps(self) -> list[list[str]]:
         """Commands to copy that it ends with, as words without "hilcal"."""
-        found = [line.strip() for line in self.lines if line.startswith("  hilcal ")]
-        found += re.findall(r"(?:[Gg]o on with|on with): (hilcal [^,]*\S)", self.text)
-        return [shlex.split(line)[1:] for line in found]
+        commands = [line.strip() for line in self.lines if line.startswith("  hilcal ")]
+        commands += re.findall(r"(?:[Gg]o on with|on with): (hilcal [^,]*\S)", self.text)
+        return [shlex.split(line)[1:] for line in commands]
 
     def number(self, pattern: str) -> float:
         """A number that stands in a pattern, or a length in m."""
-        found = re.search(pattern, self.text)
-        unit = found[2] if len(found.groups()) > 1 else "m"
-        return float(found[1]) * LENGTHS[unit]
+        match = re.search(pattern, self.text)
+        unit = match[2] if len(match.groups()) > 1 else "m"
+        return float(match[1]) * LENGTHS[unit]
 
 
 def at_terminal(home, *words, code=0):
     """Run a command there; it ends with the exit code, within 80 columns and without a rest."""
     with AtTerminal(*words, home=home, paper=300) as t:
-        found = Said(t.wait_for_end(LONG), [line.rstrip() for line in t.lines])
-    assert found.code == code, "\n".join(found.lines)
-    assert "Traceback" not in found.text
-    assert not re.search("[\u2800-\u28ff]", found.text)  # a spinner that nobody wiped away
-    wide = [x for x in found.lines if len(x) > 80 and not x.startswith("  hilcal ")]
+        outcome = Said(t.wait_for_end(LONG), [line.rstrip() for line in t.lines])
+    assert outcome.code == code, "\n".join(outcome.lines)
+    assert "Traceback" not in outcome.text
+    assert not re.search("[\u2800-\u28ff]", outcome.text)  # a spinner that nobody wiped away
+    wide = [x for x in outcome.lines if len(x) > 80 and not x.startswith("  hilcal ")]
     assert not wide
-    return found
+    return outcome
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,13 +169,13 @@ def rehearsed(home, words):
     """Measure; where this computer was too busy for the devices, go on as is said."""
     for _ in range(8):
         with AtTerminal(*words, home=home, paper=300) as t:
-            found = Said(t.wait_for_end(LONG), t.lines)
-        if found.code == 0:
-            return found
-        assert found.code == 3, found.text
-        assert STARVED.search(found.text), found.text
-        words = found.steps[-1]
-    raise AssertionError(found.text)
+            outcome = Said(t.wait_for_end(LONG), t.lines)
+        if outcome.code == 0:
+            return outcome
+        assert outcome.code == 3, outcome.text
+        assert STARVED.search(outcome.text), outcome.text
+        words = outcome.steps[-1]
+    raise AssertionError(outcome.text)
 
 
 def axis_of_joint_1(secret):
@@ -204,8 +204,8 @@ def test_the_hidden_effect_is_named_no_other_and_the_base_is_the_worlds(day):
 
 def the_base_is_true(day, said, within=2e-5):
     """The base that is printed has the axis of joint 1 where the world has it."""
-    found = re.search(r"base: at \((.*?)\) m, turned by the rotation vector \((.*?)\)°", said.text)
-    place, turn = (np.array([float(v) for v in group.split(", ")]) for group in found.groups())
+    match = re.search(r"base: at \((.*?)\) m, turned by the rotation vector \((.*?)\)°", said.text)
+    place, turn = (np.array([float(v) for v in group.split(", ")]) for group in match.groups())
     point, direction = axis_of_joint_1(day.secret)
     assert np.linalg.norm(np.cross(place - point, direction)) < within
     off = np.cross(rotation(np.radians(turn))[:, 2], direction)
@@ -282,7 +282,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     world = day.secret.world
     soft = world.physics.joint_compliance
     stiff = replace(world, physics=replace(world.physics, joint_compliance=0 * soft))
-    wanted, found = seen(stiff, states, base), c.predict(states.q)
+    wanted, prediction = seen(stiff, states, base), c.predict(states.q)
     urdf, ur = (day.home / "a.urdf").read_text(), (day.home / "a.yaml").read_text()
     exported = {
         "URDF": by_pinocchio(urdf_model(urdf), states.q) @ tool,
@@ -292,10 +292,10 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     nominal = flanges(c.model.cell.arm, states.q) @ tool
     for name, poses in exported.items():
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
-        assert np.mean(off <= found.band_m) > 0.9, name
+        assert np.mean(off <= prediction.band_m) > 0.9, name
         assert off.mean() < 0.1 * np.linalg.norm(nominal[:, :3, 3] - wanted, axis=1).mean(), name
-    predicted = np.linalg.norm(found.position - seen(world, states, base), axis=1)
-    assert np.mean(predicted <= found.band_m) > 0.9
+    predicted = np.linalg.norm(prediction.position - seen(world, states, base), axis=1)
+    assert np.mean(predicted <= prediction.band_m) > 0.9
     controller = document["controller"]
     there = inverse(of_six(controller["tracker_in_base_m_rad"]))
     np.testing.assert_allclose(there, base, atol=1e-9)

@@ -106,21 +106,21 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
 
     monkeypatch.delenv("HILCAL_DEBUG", raising=False)
     monkeypatch.setattr(looking_up, "example_cell", fails(ZeroDivisionError("by\nzero")))
-    found = run(capsys, "effects", "--json")
-    assert (found.code, found.document["error"]["kind"]) == (1, "unexpected")
-    assert "ZeroDivisionError: by zero" in found.document["error"]["message"]
-    assert "Traceback" not in found.err
+    result = run(capsys, "effects", "--json")
+    assert (result.code, result.document["error"]["kind"]) == (1, "unexpected")
+    assert "ZeroDivisionError: by zero" in result.document["error"]["message"]
+    assert "Traceback" not in result.err
     closed = OSError(errno.EROFS, "as the system words it", "run.hilcal")
     monkeypatch.setattr(looking_up, "example_cell", fails(closed))
     assert refused(capsys, 2, "effects") == "error: run.hilcal: no access (Read-only file system)"
     monkeypatch.setattr(looking_up, "example_cell", fails(ZeroDivisionError("by zero")))
     monkeypatch.setenv("HILCAL_DEBUG", "1")
-    found = run(capsys, "effects")
-    assert (found.code, "Traceback" in found.err) == (1, True)
+    result = run(capsys, "effects")
+    assert (result.code, "Traceback" in result.err) == (1, True)
     monkeypatch.setattr(looking_up, "example_cell", fails(KeyboardInterrupt()))
-    found = run(capsys, "effects", "--json")
+    result = run(capsys, "effects", "--json")
     error = {"message": "interrupted", "kind": "interrupted", "exit_code": 130}
-    assert (found.code, found.document["error"]) == (130, error)
+    assert (result.code, result.document["error"]) == (130, error)
 
 
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "rich.console", "dask")

@@ -430,7 +430,7 @@ def test_loads_that_a_table_only_names_act_as_the_cell_states_them(tmp_path, cap
     text = lines(header, [f"P{k}" for k in range(12)], names, np.rad2deg(C.q), 1e3 * C.position)
     path, mapping, run = write(tmp_path / "t.csv", text), tmp_path / "m.toml", tmp_path / "r.hilcal"
     ok(capsys, "import", path, "--config", CELL, "--preview", "-o", mapping)
-    found = ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", run, "--json")
+    result = ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", run, "--json")
     with CampaignFile.open(run) as file:
         r = file.readings()
     cell = cell_from_config(load_config(CELL))
@@ -438,7 +438,7 @@ def test_loads_that_a_table_only_names_act_as_the_cell_states_them(tmp_path, cap
     for name, of in (("none", None), ("10 kg", "10kg"), ("pull x", "pull x"), ("box", None)):
         wrench = r.states.wrench[r.load == r.load_names.index(name)]
         np.testing.assert_array_equal(wrench, [stated[of] if of else np.zeros(6)] * 3)
-    notes = " ".join(found.document["notes"])
+    notes = " ".join(result.document["notes"])
     assert "load 10 kg: its force is that of [[loads]]" in notes
     assert "load box: its force is not stated by the table, nor by [[loads]]" in notes
 
@@ -542,8 +542,8 @@ def test_columns_of_robots_and_instruments(header, section, columns, tmp_path, c
     if section == "missing":
         assert columns in d["missing"][0]
         return
-    found = d["mapping"].get(section)
-    named = found and found.get("column", found.get("columns"))
+    result = d["mapping"].get(section)
+    named = result and result.get("column", result.get("columns"))
     of = {6: header[:6], 3: header[6:9]}
     assert named == of.get(columns, columns)
 

@@ -223,11 +223,11 @@ def sent(tmp_path):
 def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file(sent, capsys):
     path, _ = sent
     document = json.loads(ok(capsys, "identify", path, "--json").out)
-    found = {p["name"]: p["value"] for p in document["parameters"]}
+    by_name = {p["name"]: p["value"] for p in document["parameters"]}
     fitted = simulated()
     for e in fitted.parameters:
         if e.name.startswith("joint_compliance") and e.value is not None:
-            assert found[e.name] == pytest.approx(e.value, rel=1e-3)
+            assert by_name[e.name] == pytest.approx(e.value, rel=1e-3)
     cell = path.parent / "out" / "cell.toml"
     cell.parent.mkdir()
     ok(capsys, "export", path, "--cell", cell)

@@ -219,10 +219,10 @@ def test_the_last_line_is_the_next_command(run, capsys, monkeypatch, name, reaso
         return replace(d, reason=reason, suspects=())
 
     def refined(*args):
-        found = refine(*args)
-        last = found.steps[-1]
+        refinement = refine(*args)
+        last = refinement.steps[-1]
         last = replace(last, diagnosis=unexplained(last.diagnosis))
-        return replace(found, steps=(*found.steps[:-1], last))
+        return replace(refinement, steps=(*refinement.steps[:-1], last))
 
     monkeypatch.setattr("hilcal.cli.refining.judge", lambda *a: unexplained(diagnose(*a)))
     monkeypatch.setattr("hilcal.cli.refining.refine_model", refined)

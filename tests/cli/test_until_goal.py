@@ -48,9 +48,9 @@ def rule(text, c, **planning):
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
 def test_it_is_what_identify_states(mode):
     c = campaign(mode=mode, poses=8)
-    found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-    rows = found.model.slices()[found.model.names.index("joint_compliance")]
-    share = 100 * np.max(found.uncertainty.std[rows] / np.abs(found.theta[rows]))
+    fitted = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
+    rows = fitted.model.slices()[fitted.model.names.index("joint_compliance")]
+    share = 100 * np.max(fitted.uncertainty.std[rows] / np.abs(fitted.theta[rows]))
     for factor, met in ((1.001, True), (0.999, False)):
         text = f"joint std < {factor * share} %"
         status = rule(text, c, readings=mode)(c.readings, last=False)
@@ -86,8 +86,8 @@ def test_the_position_is_as_sure_as_it_says():
         if k % 5 == 0:
             stated.append(stop_rule(readings, last=False).std)
         model = baseline(c.cell, readings, "absolute")
-        found = fit(model, readings, "absolute")
-        errors.append(model.predict(states, found.theta).observation.position)
+        fitted = fit(model, readings, "absolute")
+        errors.append(model.predict(states, fitted.theta).observation.position)
     scatter = np.sqrt(np.mean(np.sum(np.var(errors, axis=0, ddof=1), axis=1)))
     assert np.median(stated) == pytest.approx(scatter, rel=0.2)
     assert status_words(stop_rule.status).startswith("predicted position ± ")
@@ -142,8 +142,8 @@ def test_a_goal_is_of_what_the_readings_show(what, mode, valid):
 def test_an_estimated_uncertainty_must_do_twice():
     """With an effect that the model lacks it comes from leaving out poses, and is itself rough."""
     c = campaign("joint_tilt_compliance", mode="deflection", poses=10, strength=3.0)
-    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
-    assert found.uncertainty.inflated
+    fitted = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    assert fitted.uncertainty.inflated
     stop_rule = rule("j2 std < 500 %", c)
     assert [stop_rule(c.readings, last=False).met for _ in range(2)] == [False, True]
     assert rule("j2 std < 500 %", c)(c.readings, last=True).met

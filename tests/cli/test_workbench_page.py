@@ -64,8 +64,10 @@ class Served:
         given = {k.replace("_", "-"): v for k, v in heads.items()}
         with closing(HTTPConnection("127.0.0.1", self.port, timeout=30)) as line:
             line.request(method, path, headers=given)
-            found = line.getresponse()
-            return Answer(found.status, found.headers, found.read().decode("utf-8", "replace"))
+            response = line.getresponse()
+            return Answer(
+                response.status, response.headers, response.read().decode("utf-8", "replace")
+            )
 
     @cached_property
     def cookie(self) -> str:
@@ -108,14 +110,14 @@ def workbench(folder, browser=False, *given):
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    with workbench(tmp_path_factory.mktemp("bench")) as found:
-        yield found
+    with workbench(tmp_path_factory.mktemp("bench")) as page_server:
+        yield page_server
 
 
 @pytest.fixture(scope="module")
 def browser():
-    with open_browser() as found:
-        yield found
+    with open_browser() as started:
+        yield started
 
 
 def test_only_the_browser_with_the_address_is_let_in(served):
@@ -474,8 +476,8 @@ def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
             download.value.save_as(tmp_path / place)
             came(page, "download", "done", f"Your browser has {place} now")
         assert "joint_compliance" in (tmp_path / "t.html").read_text()
-        found = Calibration.load(tmp_path / "t-calibration.json")
-        assert found.source["revision"] == 2
+        calibration = Calibration.load(tmp_path / "t-calibration.json")
+        assert calibration.source["revision"] == 2
         again = import_campaign(tmp_path / "t-readings.csv", config, tmp_path / "again.hilcal")
         with Campaign.open(served.run, read_only=True) as o:
             assert np.allclose(again.readings.covariance, o.readings.covariance, rtol=1e-9)

@@ -69,9 +69,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[Path, Parsed]:
-    found = {p: Parsed(p.read_text(encoding="utf-8")) for p in sorted(site.rglob("*.html"))}
-    del found[site / "404.html"]  # its links begin at the root of a server
-    return found
+    parsed = {p: Parsed(p.read_text(encoding="utf-8")) for p in sorted(site.rglob("*.html"))}
+    del parsed[site / "404.html"]  # its links begin at the root of a server
+    return parsed
 
 
 @pytest.fixture(scope="module")
@@ -151,10 +151,10 @@ def test_the_search_finds_an_effect(address: str) -> None:
         page.click(".md-search__input")
         page.keyboard.type("hysteresis", delay=50)  # as a person; what is filled in is not heard
         page.wait_for_selector(".md-search-result__item")
-        found = page.eval_on_selector_all(
+        links = page.eval_on_selector_all(
             ".md-search-result__link", "links => links.map(link => link.getAttribute('href'))"
         )
-    assert any("effects/hysteresis.html" in link for link in found)
+    assert any("effects/hysteresis.html" in link for link in links)
 
 
 @needs_chromium
@@ -210,5 +210,5 @@ def test_names_keys_and_links_have_their_entries(site: Path, pages: dict[Path, P
             assert key.name in said, (section.name, key.name)
     listed = (site / "external-links.txt").read_text(encoding="utf-8").splitlines()
     known = {line.split("\t")[0] for line in listed}
-    found = {link for page in pages.values() for link in page.links if urlsplit(link).scheme}
-    assert found <= known
+    linked = {link for page in pages.values() for link in page.links if urlsplit(link).scheme}
+    assert linked <= known

@@ -26,7 +26,7 @@ def main() -> int:
     if asked.replay is not None:
         print(known[names[0]].parse(asked.replay.read_bytes()))
         return 0
-    found = False
+    any_findings = False
     for name in names:
         begun = time.process_time()
         out = harness.fuzz(known[name], asked.inputs, asked.seed, asked.keep)
@@ -40,12 +40,12 @@ def main() -> int:
         )
         for line, count in out.findings.most_common():
             print(f"  {count} x {line}  {out.kept.get(line, '')}", flush=True)
-        found = found or bool(out.findings)
+        any_findings = any_findings or bool(out.findings)
         if asked.out is not None:
             _add(asked.out, name, asked.seed, out, seconds)
         if out.stopped:
             break
-    return int(found)
+    return int(any_findings)
 
 
 def _add(path: Path, name: str, seed: int, out: harness.Outcome, seconds: float) -> None:

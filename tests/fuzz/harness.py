@@ -86,7 +86,7 @@ def fuzz(parser: Parser, inputs: int, seed: int, keep: Path | None = None) -> Ou
 def _one(parser: Parser, data: bytes, out: Outcome, keep: Path | None) -> None:
     """Give one input."""
     out.inputs += 1
-    found, begun = "", time.process_time()
+    text, begun = "", time.process_time()
     signal.setitimer(signal.ITIMER_PROF, parser.limit_s)
     try:
         out.read += parser.parse(data)
@@ -95,19 +95,19 @@ def _one(parser: Parser, data: bytes, out: Outcome, keep: Path | None) -> None:
     except Collision:
         out.collisions += 1
     except Hung:
-        found = f"more than {parser.limit_s:g} s"
+        text = f"more than {parser.limit_s:g} s"
     except Exception as error:
-        found = finding(error)
+        text = finding(error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
     out.slowest_s = max(out.slowest_s, time.process_time() - begun)
-    if found:
-        out.findings[found] += 1
-        if keep is not None and found not in out.kept:
+    if text:
+        out.findings[text] += 1
+        if keep is not None and text not in out.kept:
             keep.mkdir(parents=True, exist_ok=True)
             path = keep / f"{parser.name}-{hashlib.sha256(data).hexdigest()[:12]}"
             path.write_bytes(data)
-            out.kept[found] = str(path)
+            out.kept[text] = str(path)
     if out.inputs % 5000 == 0:
         gc.collect()
 

@@ -83,13 +83,13 @@ movej([0.2, -1.4, 1.1, 0.1, 0.3, 0.2])
 
 def _told(file: CampaignFile) -> None:
     """Ask for everything that a campaign file says of itself."""
-    found = overview(file)
+    facts = overview(file)
     console = Console(file=io.StringIO(), width=100)
-    for part in info_report(found, "x", "instrument"):
+    for part in info_report(facts, "x", "instrument"):
         console.print(part)
-    to_json(found, "x", "instrument")
-    revision_table(found.revisions, found.in_use)
-    for record in found.revisions:
+    to_json(facts, "x", "instrument")
+    revision_table(facts.revisions, facts.in_use)
+    for record in facts.revisions:
         two_revisions(record, record)
     if file.about(run_log.PLAN) is not None:
         log = run_log.RunLog(file)
@@ -205,23 +205,23 @@ def _revision(path: Path) -> None:
 
 def _compensated(path: Path) -> None:
     """Read a calibration, predict, and compensate with uncertainty."""
-    found = Calibration.load(path)
-    q, wrench = np.full((2, found.model.cell.arm.n), 0.3), np.zeros((2, 6))
-    if not np.all(np.isfinite(found.predict(q, wrench).position)):
+    calibration = Calibration.load(path)
+    q, wrench = np.full((2, calibration.model.cell.arm.n), 0.3), np.zeros((2, 6))
+    if not np.all(np.isfinite(calibration.predict(q, wrench).position)):
         raise Accepted("calibration: a position that is not finite")
     if zlib.crc32(path.read_bytes()) % 20 == 0:
         with np.errstate(all="ignore"):
-            found.compensate(q, wrench)
+            calibration.compensate(q, wrench)
 
 
 def _carried(path: Path) -> None:
     prior = carried_prior(read_posterior(path))
     check_arm(prior, load_arm("ur10e"))
-    found = prior.posterior
-    prior.index_in(found.names)
-    if prior.unit.shape != found.mean.shape or prior.group.shape != found.mean.shape:
+    posterior = prior.posterior
+    prior.index_in(posterior.names)
+    if prior.unit.shape != posterior.mean.shape or prior.group.shape != posterior.mean.shape:
         raise Accepted("prior: arrays of other lengths")
-    if not all(np.all(np.isfinite(a)) for a in (found.mean, found.scale, found.prints)):
+    if not all(np.all(np.isfinite(a)) for a in (posterior.mean, posterior.scale, posterior.prints)):
         raise Accepted("prior: numbers that are not finite")
 
 

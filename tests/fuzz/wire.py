@@ -209,8 +209,8 @@ def primary_port() -> Parser:
 
     def parse(data: bytes) -> bool:
         with network(data):
-            found = reading.read_kinematics("fuzz", 1.0)
-        if not np.isfinite(found.links).all():
+            kinematics = reading.read_kinematics("fuzz", 1.0)
+        if not np.isfinite(kinematics.links).all():
             raise Accepted("primary: transforms that are no numbers")
         return True
 

@@ -25,8 +25,8 @@ def test_errors_over_their_stated_size_have_unit_spread_with_a_prior() -> None:
         )
         known = fit(with_effects(c.cell, a, "absolute", NAMES), a, "absolute")
         prior = carried_prior(Posterior.of(known))
-        found = fit(with_effects(c.cell, b, "absolute", NAMES, prior=prior), b, "absolute")
-        z.append((found.theta - truth) / found.uncertainty.std)
+        fitted = fit(with_effects(c.cell, b, "absolute", NAMES, prior=prior), b, "absolute")
+        z.append((fitted.theta - truth) / fitted.uncertainty.std)
     spread = float(np.sqrt(np.mean(np.square(z))))
     # 60 x 12 correlated values scatter by less than 6 %; drift that nothing asked for widens.
     assert 0.8 < spread < 1.12

@@ -50,11 +50,11 @@ def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
             readings = estimated(readings, rng)
         elif kind == "unequal numbers":
             readings = unequal(readings, rng)
-        found = fit(baseline(c.cell, readings, mode), readings, mode)
+        fitted = fit(baseline(c.cell, readings, mode), readings, mode)
         if kind == "several effects":
             for name in IN_THE_MODEL[mode]:
-                found = add(found, name)
-        p = linearise(found)
+                fitted = add(fitted, name)
+        p = linearise(fitted)
         for s in rank_suspects(p, candidates(p.fit)):
             if s.score.rank:
                 out.setdefault(s.effect, []).append(s.score.p_value)
@@ -65,13 +65,13 @@ def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
 
 
 def check(kind: str, mode: str, count: int) -> None:
-    found = p_values(kind, mode, range(count))
-    assert len(found) > len(installed().names) // 2
-    for effect, p in found.items():
+    uniform = p_values(kind, mode, range(count))
+    assert len(uniform) > len(installed().names) // 2
+    for effect, p in uniform.items():
         assert len(p) > 0.8 * count, effect
         # Families are tested one by one, about a hundred over all cases: one in 1e5 each.
         assert kstest(p, "uniform").pvalue > 1e-5, (effect, np.round(sorted(p)[:5], 4))
-    suspects = [np.array(p) for name, p in found.items() if not name.startswith("where")]
+    suspects = [np.array(p) for name, p in uniform.items() if not name.startswith("where")]
     least = np.min([p[: min(map(len, suspects))] for p in suspects], axis=0)
     alarms = int(np.sum(least * len(suspects) < 1e-2))  # any effect named, one in a hundred
     assert alarms <= poisson.isf(1e-3, 1e-2 * len(least))

@@ -97,7 +97,7 @@ def test_a_model_of_one_series_predicts_the_other(ipa_ur10):
     for step in refined("B", ipa_ur10).steps:
         b = step.fit
         p = set_up_anew(predictive_of(b), b.readings, c.readings, "absolute")
-        found = validate(p.model, p.theta, b.readings, c.readings, "absolute", registered=True)
-        errors[step.added] = found.error.mean_m
+        validation = validate(p.model, p.theta, b.readings, c.readings, "absolute", registered=True)
+        errors[step.added] = validation.error.mean_m
     assert errors["link_geometry"] < 0.6 * plain
     assert [*errors.values()][-1] < 0.8 * plain

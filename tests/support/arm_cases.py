@@ -79,8 +79,8 @@ def slots_of(arm, q):
 
 def flange_at(chain, state, pose, atol=1e-12):
     """Assert where the flange is in a state: a pose (4, 4)."""
-    found = chain.rotation[-1, state], chain.position[-1, state]
-    np.testing.assert_allclose(np.column_stack(found), pose[:3], rtol=0, atol=atol)
+    result = chain.rotation[-1, state], chain.position[-1, state]
+    np.testing.assert_allclose(np.column_stack(result), pose[:3], rtol=0, atol=atol)
 
 
 def same_flange(one, other):

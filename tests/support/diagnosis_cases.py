@@ -11,10 +11,10 @@ from tests.support.fit_cases import fitted_model
 def fitted_baseline(c, *effects, readings=None):
     """The baseline of a campaign, fitted, with effects added."""
     given = c.readings if readings is None else readings
-    found = fit(baseline(c.cell, given, c.mode), given, c.mode)
+    fitted = fit(baseline(c.cell, given, c.mode), given, c.mode)
     for name in effects:
-        found = add(found, name)
-    return found
+        fitted = add(fitted, name)
+    return fitted
 
 
 def studied(mode, *hidden, robot="ur5e", seed=1, strength=3.0, **more):

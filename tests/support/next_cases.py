@@ -59,24 +59,24 @@ def doubtful(effect, seed):
     """A small campaign with a weak hidden effect."""
     secret = case_of_plan(SMALL, first_plan(), effect, seed)
     r = simulate_plan(secret, first_plan(), [seed, 1])
-    found = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
-    return Doubtful(secret, first_plan(), r, found, diagnose(found))
+    fitted = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
+    return Doubtful(secret, first_plan(), r, fitted, diagnose(fitted))
 
 
 def after_further_plan(first, poses=20):
     """Plan what separates the suspects, measure it in the same world, and diagnose all."""
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
-    found = plan_separating(
+    separating_plan = plan_separating(
         cell.with_config(SMALL), first.fit, first.suspects, PlanRequest(poses),
         np.random.default_rng(1),
         reference=reference,
     )  # fmt: skip
-    further = with_new_names(found.planned.ordered.plan, first.plan, 2)
+    further = with_new_names(separating_plan.planned.ordered.plan, first.plan, 2)
     more = simulate_plan(first.secret, further, [9, 2], 3000.0).readings
     readings = joined_readings(first.rehearsal.readings, more)
     mode = first.rehearsal.mode
-    return diagnose(fit(baseline(cell, readings, mode), readings, mode)), found
+    return diagnose(fit(baseline(cell, readings, mode), readings, mode)), separating_plan
 
 
 def joined_readings(a, b):

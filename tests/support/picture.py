@@ -66,9 +66,13 @@ def pictures(rrd, shots, size=(1920, 1080), longest=None):
         for shot in shots:
             _take(viewer, shot, longest)
             for v in viewer.get_state().views:
-                found = problems.setdefault(v.name or v.view_id, set())
-                found.update(f"{r.severity}: {r.summary} {r.details or ''}" for r in v.reports)
-    return tuple(ViewReport(name, tuple(sorted(found))) for name, found in problems.items())
+                view_problems = problems.setdefault(v.name or v.view_id, set())
+                view_problems.update(
+                    f"{r.severity}: {r.summary} {r.details or ''}" for r in v.reports
+                )
+    return tuple(
+        ViewReport(name, tuple(sorted(view_problems))) for name, view_problems in problems.items()
+    )
 
 
 @contextlib.contextmanager

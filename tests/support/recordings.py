@@ -15,8 +15,8 @@ def chunks(path, entity=""):
 def values(path, entity, component):
     """Every value of a component, row after row."""
     batches = (chunk.to_record_batch() for chunk in chunks(path, entity))
-    found = [batch.column(component) for batch in batches if component in batch.schema.names]
-    return [value for column in found for value in column.to_pylist() if value is not None]
+    selected = [batch.column(component) for batch in batches if component in batch.schema.names]
+    return [value for column in selected for value in column.to_pylist() if value is not None]
 
 
 def rows(path, entity, component, timeline="step"):
@@ -26,14 +26,14 @@ def rows(path, entity, component, timeline="step"):
         batch = chunk.to_record_batch()
         if component not in batch.schema.names:
             continue
-        found = batch.column(component).to_pylist()
+        cells = batch.column(component).to_pylist()
         if timeline in batch.schema.names:
             times = batch.column(timeline).to_pylist()
         elif not chunk.timeline_names:
-            times = [0] * len(found)
+            times = [0] * len(cells)
         else:
             continue
-        out |= {int(t): v for t, v in zip(times, found, strict=True) if v is not None}
+        out |= {int(t): v for t, v in zip(times, cells, strict=True) if v is not None}
     return out
 
 

@@ -72,9 +72,9 @@ def check(case, line):
     path = FOLDER / f"{case[0]}.txt"
     text = path.read_text(encoding="utf-8")
     assert "\n" not in line
-    (found,) = (m for m in BLOCK.finditer(text) if m[1] == case[1])
-    begun = found[3].endswith("…") and line.startswith(found[3][:-1])
+    (blocks,) = (m for m in BLOCK.finditer(text) if m[1] == case[1])
+    begun = blocks[3].endswith("…") and line.startswith(blocks[3][:-1])
     if os.environ.get("HILCAL_REFUSALS") == "write" and not begun:
-        path.write_text(text[: found.start(3)] + line + text[found.end(3) :], encoding="utf-8")
+        path.write_text(text[: blocks.start(3)] + line + text[blocks.end(3) :], encoding="utf-8")
     else:
-        assert begun or line == found[3]
+        assert begun or line == blocks[3]

@@ -16,12 +16,12 @@ ALLOWED = ("file:", "data:", "blob:")
 
 def write_campaign(path, poses=6):
     """A campaign in which joints tilt; one pose and one load have names that look like markup."""
-    found = campaign("joint_tilt_compliance", "deflection", poses=poses, strength=8.0).readings
-    names = (f"{EVIL}1", *found.pose_names[1:])
-    loads = (*found.load_names[:-1], f'"><img src=x onerror="window.harmed = 2">{EVIL}')
+    measured = campaign("joint_tilt_compliance", "deflection", poses=poses, strength=8.0).readings
+    names = (f"{EVIL}1", *measured.pose_names[1:])
+    loads = (*measured.load_names[:-1], f'"><img src=x onerror="window.harmed = 2">{EVIL}')
     content = configuration().to_json()
     with CampaignFile.create(path, content, str(configs_dir() / "cells"), EVIL) as file:
-        file.append_readings(replace(found, pose_names=names, load_names=loads))
+        file.append_readings(replace(measured, pose_names=names, load_names=loads))
 
 
 @cache

@@ -92,16 +92,16 @@ class AtTerminal:
             if not select.select([self._master], [], [], left)[0]:
                 break
             try:
-                found = os.read(self._master, 65536)
+                received = os.read(self._master, 65536)
             except OSError:  # the program has closed its terminal
-                found = b""
-            if not found:
+                received = b""
+            if not received:
                 self._open = False
                 break
             now = time.monotonic()
             self._silences.append((now - self._heard, (self.lines or [""])[-1]))
             self._heard = now
-            self._stream.feed(found)
+            self._stream.feed(received)
         return self._open
 
     def wait_for_words(self, words, times=1):

@@ -133,13 +133,13 @@ class Machine:
         if runs and re.fullmatch(r"(\w+\s*=\s*)?", head):
             self.threads.append((thread, scopes, line))
             text = f"{head}0"
-        found = re.fullmatch(
+        match = re.fullmatch(
             r"(?:(global|local)\s+)?([A-Za-z_]\w*)\s*(?:\[([^\]]*)\])?\s*=(?!=)(.*)", text
         )
-        if not found:
+        if not match:
             self._evaluate(text, scopes, line)
             return
-        where, name, index, value = found.groups()
+        where, name, index, value = match.groups()
         new = self._copied(self._evaluate(value, scopes, line))
         if index is not None:
             old = self._read(name, scopes)

@@ -81,8 +81,8 @@ BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand
 
 
 def configured(**sections):
-    told = load_config(CELL).model_dump(mode="json", exclude_none=True)
-    config = CellConfig.model_validate(told | sections)
+    config_sections = load_config(CELL).model_dump(mode="json", exclude_none=True)
+    config = CellConfig.model_validate(config_sections | sections)
     return cell_from_config(config)
 
 

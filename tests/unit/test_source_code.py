@@ -51,14 +51,14 @@ OF_THE_CELL = {"load_point"}
 
 def test_no_module_outside_of_the_effects_asks_for_one_by_its_name():
     names = {*NAMES} - OF_THE_CELL
-    found = [
+    uses = [
         f"{name}:{node.lineno}: {node.value}"
         for name in of_hilcal()
         if not name.startswith(DEFAULTS)
         for node in nodes(name)
         if isinstance(node, ast.Constant) and str(node.value).split(".")[0] in names
     ]
-    assert not found
+    assert not uses
 
 
 # files are written whole
@@ -134,9 +134,9 @@ def writes(call):
 
 
 def test_no_file_is_written_straight_to_its_place():
-    found = {name: lines for name, tree in modules().items() if (lines := [*direct_writes(tree)])}
-    assert {name: at for name, at in found.items() if name not in STRAIGHT} == {}, "use whole_file"
-    assert set(STRAIGHT) - set(found) == set(), "take them from the list"
+    result = {name: lines for name, tree in modules().items() if (lines := [*direct_writes(tree)])}
+    assert {name: at for name, at in result.items() if name not in STRAIGHT} == {}, "use whole_file"
+    assert set(STRAIGHT) - set(result) == set(), "take them from the list"
 
 
 # command lines in messages
@@ -150,7 +150,7 @@ RUN_BY_PEOPLE = re.compile(
 
 def unquoted(among):
     """Lines in which a value stands as it is in a command line that people are told to run."""
-    found = []
+    collected = []
     for node in among:
         text = ""
         for part in node.values if isinstance(node, ast.JoinedStr) else ():
@@ -159,9 +159,9 @@ def unquoted(among):
                 continue
             called = getattr(getattr(part.value, "func", None), "id", "")
             if RUN_BY_PEOPLE.search(text) and called != "quoted":
-                found.append(node.lineno)
+                collected.append(node.lineno)
             text += "X"
-    return found
+    return collected
 
 
 def test_values_in_command_lines_are_quoted():
@@ -193,7 +193,7 @@ def sentences(among):
 
 def test_every_command_of_a_message_has_the_options_that_it_names(capsys):
     said = [text for name in of_hilcal() for text in sentences(nodes(name))]
-    named = [found for text in said for found in re.findall(STEP, text)]
+    named = [matches for text in said for matches in re.findall(STEP, text)]
     helps = {name: ok(capsys, name, "--help").out for name in {name for name, _ in named}}
     assert len(named) > 80
     for name, words in named:

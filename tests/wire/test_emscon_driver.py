@@ -284,12 +284,16 @@ def test_the_client_of_others_measures_the_same(there):
         listed = command.GetReflectors()
         assert (listed.iTotalReflectors, listed.iInternalReflectorId) == (2, 1)
         assert listed.cReflectorName.decode("utf-16-le").rstrip("\0") == "RRR 1.5in"
-        found = command.StartMeasurement()
-        assert packet.packetType(found) == packet.ES_DT_SingleMeasResult2
-        assert (found.dVal1, found.dVal2, found.dVal3) == pytest.approx(TARGET, abs=1e-3)
-        total = np.sqrt(found.dAprioriStd1**2 + found.dAprioriStd2**2 + found.dAprioriStd3**2)
-        assert found.dAprioriStdTotal == pytest.approx(total)
-        assert found.dTemperature == 20.0
+        measurement = command.StartMeasurement()
+        assert packet.packetType(measurement) == packet.ES_DT_SingleMeasResult2
+        assert (measurement.dVal1, measurement.dVal2, measurement.dVal3) == pytest.approx(
+            TARGET, abs=1e-3
+        )
+        total = np.sqrt(
+            measurement.dAprioriStd1**2 + measurement.dAprioriStd2**2 + measurement.dAprioriStd3**2
+        )
+        assert measurement.dAprioriStdTotal == pytest.approx(total)
+        assert measurement.dTemperature == 20.0
         there[0].admin("beam", on=True)
         with pytest.raises(Exception, match="49 failed with status 10009"):
             command.StartMeasurement()

@@ -271,16 +271,16 @@ def test_faults_that_are_overcome_cost_nothing(cell, path):
 
 def loaded(run):
     """Wait for a reading under a load; returns its name."""
-    found = []
+    collected = []
 
     def under_load():
         name = run.site.ask("world", "state")["load"]
-        found[:] = [] if name is None else [name]
+        collected[:] = [] if name is None else [name]
         now = run.output.rstrip().rpartition("\n")[2]
-        return bool(found) and "measuring" in now and found[0] in now
+        return bool(collected) and "measuring" in now and collected[0] in now
 
     run.wait_until(under_load, "a reading under a load")
-    return found[0]
+    return collected[0]
 
 
 def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(cell, path):

@@ -259,14 +259,14 @@ def test_ft300_serves_a_modbus_library_that_no_driver_uses():
         assert client.connect()
 
         def held(address, count, kind):
-            found = client.read_holding_registers(address, count=count, device_id=9)
-            return client.convert_from_registers(found.registers, kind)
+            registers = client.read_holding_registers(address, count=count, device_id=9)
+            return client.convert_from_registers(registers.registers, kind)
 
         try:
             assert held(500, 5, client.DATATYPE.STRING) == "SIM-1.0.10"
             assert held(510, 4, client.DATATYPE.STRING) == "F3004242"
-            found = client.read_input_registers(180, count=6, device_id=9)
-            counts = client.convert_from_registers(found.registers, client.DATATYPE.INT16)
+            registers = client.read_input_registers(180, count=6, device_id=9)
+            counts = client.convert_from_registers(registers.registers, client.DATATYPE.INT16)
             wrench = np.array(counts) / np.repeat((100, 1000), 3)
             slack = 6 * np.repeat((0.1, 0.005), 3) + 5 * DRIFT_STD.max() * 0.5
             now = WRENCH + np.array(ft300.admin("state")["bias"])

@@ -54,13 +54,13 @@ def test_frames_come_whole_however_the_stream_is_cut_into_pieces(kind, data):
     stream = b"".join(frames)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
     deframer = Deframer(FORMATS[kind])
-    found = []
+    collected = []
     for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-        found += deframer.push(stream[start:end])
+        collected += deframer.push(stream[start:end])
     kept = (
         bodies if not FORMATS[kind].weak_checksum else bodies[:-1]
     )  # a sum waits for the next header
-    assert found == kept
+    assert collected == kept
     assert (deframer.frames, deframer.corrupt, deframer.skipped) == (len(kept), 0, 0)
 
 
@@ -68,8 +68,8 @@ def test_frames_come_whole_however_the_stream_is_cut_into_pieces(kind, data):
 def test_a_stream_entered_in_the_middle_of_a_frame_has_lost_nothing(kind):
     bodies, frames = frames_of(kind, 20, np.random.default_rng(4))
     deframer = Deframer(FORMATS[kind])
-    found = deframer.push(FORMATS[kind].header + b"".join(frames)[5:])
-    assert found[0] == bodies[1]
+    frames_read = deframer.push(FORMATS[kind].header + b"".join(frames)[5:])
+    assert frames_read[0] == bodies[1]
     assert (deframer.corrupt, deframer.skipped) == (0, 0)
 
 
@@ -81,18 +81,19 @@ def test_no_wrong_frame_is_accepted_from_a_damaged_stream(kind, seed):
     weak = FORMATS[kind].weak_checksum  # two flips may cancel in a mere sum
     stream, whole = damaged(frames, rng, most_bits=1 if weak else 3)
     deframer = Deframer(FORMATS[kind])
-    found = []
+    collected = []
     for frame in stream:
-        found += deframer.push(frame)
-    numbers = [struct.unpack_from("<I", body)[0] for body in found]
+        collected += deframer.push(frame)
+    numbers = [struct.unpack_from("<I", body)[0] for body in collected]
     assert all(
-        0 <= k < len(bodies) and body == bodies[k] for k, body in zip(numbers, found, strict=True)
+        0 <= k < len(bodies) and body == bodies[k]
+        for k, body in zip(numbers, collected, strict=True)
     )
     assert numbers == sorted(set(numbers))
     # a damaged frame costs itself, and a whole one only between two damaged ones or, for the
     # mere sum, before one
     bad = int(np.sum(~whole))
-    assert len(found) >= len(frames) - (2.2 if weak else 1.2) * bad
+    assert len(collected) >= len(frames) - (2.2 if weak else 1.2) * bad
     assert 0.8 * bad <= deframer.corrupt <= 1.3 * bad
 
 

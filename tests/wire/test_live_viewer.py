@@ -61,11 +61,11 @@ def live_process(run):
 
 def drawn(recording):
     """Readings that a recording of one session shows, with those of earlier sessions."""
-    found = 0
+    count = 0
     for kind in ("arrows", "dots"):
         chunks = RrdReader(recording).stream().filter(content=f"/world/live/1/{kind}").to_chunks()
-        found += sum(c.to_record_batch().num_rows for c in chunks)
-    return found
+        count += sum(c.to_record_batch().num_rows for c in chunks)
+    return count
 
 
 @pytest.mark.usefixtures("nothing_goes_on")
@@ -118,8 +118,8 @@ def revisions(recording):
         batches = [c.to_record_batch() for c in chunks]
     except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
         return set()
-    found = [b["revision"].to_pylist() for b in batches if "revision" in b.schema.names]
-    return {k for one in found for k in one}
+    selected = [b["revision"].to_pylist() for b in batches if "revision" in b.schema.names]
+    return {k for one in selected for k in one}
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")

@@ -336,9 +336,9 @@ def listening(pid):
 
 
 def test_the_simulated_arm_listens_on_loopback_alone(cell):
-    found = listening(cell.processes()["arm"])
-    assert len(found) == 4  # RTDE, dashboard, primary, script
-    assert all(address.startswith("127.") for address in found)
+    addresses = listening(cell.processes()["arm"])
+    assert len(addresses) == 4  # RTDE, dashboard, primary, script
+    assert all(address.startswith("127.") for address in addresses)
 
 
 def test_admin_lines_are_of_the_user_who_started_them(cell):

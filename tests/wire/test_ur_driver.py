@@ -236,9 +236,11 @@ def test_versions_of_polyscope_x(tmp_path, version, says):
         closing(open_arm(cases.config(running.host))) as arm,
     ):
         np.testing.assert_allclose(arm.sample().q, running.admin()["q"], atol=1e-4)
-        problems = [found for found in arm.report().problems if "RTDE comes at" not in found]
+        problems = [
+            reported for reported in arm.report().problems if "RTDE comes at" not in reported
+        ]
         if says:
-            assert [says in found for found in problems] == [True]
+            assert [says in reported for reported in problems] == [True]
             with pytest.raises(DeviceError, match=f"cannot take control: .*{says}"):
                 arm.take_control(cases.MASS, cases.COM)
         else:

@@ -278,9 +278,9 @@ def test_kinematics_are_found_among_other_packages():
     state = package(16, package(0, b"modes") + part + package(6, b"configuration"))
     said = package(20, b"a message") + package(16, package(0, b"modes")) + state
     with server(PRIMARY_PORT, lambda asked: said) as (host, _):
-        found = read_kinematics(host, 2.0)
-    np.testing.assert_array_equal(found.rows.ravel(), rows)
-    assert (found.status, found.checksum) == (2, (0, 1, 2, 3, 4, 5))
+        kinematics = read_kinematics(host, 2.0)
+    np.testing.assert_array_equal(kinematics.rows.ravel(), rows)
+    assert (kinematics.status, kinematics.checksum) == (2, (0, 1, 2, 3, 4, 5))
 
 
 ASK = {
@@ -329,6 +329,6 @@ def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version):
 
 def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path):
     with closing(cases.start(tmp_path)) as running:
-        found = read_kinematics(running.host, 2.0)
-    np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)
-    assert found.status == 0
+        kinematics = read_kinematics(running.host, 2.0)
+    np.testing.assert_allclose(kinematics.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)
+    assert kinematics.status == 0

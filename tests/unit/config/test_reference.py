@@ -34,8 +34,8 @@ FIELDS = [
 
 
 def key_of(section, key):
-    (found,) = [k for k in TABLES[section].keys if k.name == key]
-    return found
+    (selected,) = [k for k in TABLES[section].keys if k.name == key]
+    return selected
 
 
 def numeric(annotation):
@@ -48,16 +48,16 @@ def numeric(annotation):
 
 @pytest.mark.parametrize(("section", "key", "field"), FIELDS, ids=lambda x: str(x)[:30])
 def test_every_key_has_unit_default_and_an_example_that_is_valid(section, key, field):
-    found = key_of(section, key)
-    assert found.valid == field.description
+    result = key_of(section, key)
+    assert result.valid == field.description
     adapter = TypeAdapter(Annotated[field.annotation, *field.metadata, field])
-    value = tomllib.loads(found.example)
+    value = tomllib.loads(result.example)
     assert list(value) == [key]
     adapter.validate_python(value[key])
     if field.is_required():
-        assert found.default == REQUIRED
-    elif found.default != NOT_SET:
-        default = tomllib.loads(f"x = {found.default}")["x"]
+        assert result.default == REQUIRED
+    elif result.default != NOT_SET:
+        default = tomllib.loads(f"x = {result.default}")["x"]
         assert adapter.validate_python(default) == field.get_default(call_default_factory=True)
     else:
         assert field.get_default(call_default_factory=True) in (None, (), {})
@@ -70,7 +70,7 @@ def test_every_key_has_unit_default_and_an_example_that_is_valid(section, key, f
         "robot_api_port",
     }  # numbers without a unit
     if numeric(field.annotation) and section_of(field) is None and key not in texts:
-        assert found.unit
+        assert result.unit
 
 
 def test_the_example_of_a_section_is_a_section():

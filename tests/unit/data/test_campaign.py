@@ -490,10 +490,10 @@ def test_a_file_of_an_older_program(path, tmp_path):
         assert len(run.readings) == 30
         assert run.file.data_hash() == HASHES[path.name.split(".")[0]]
         (record,) = run.file.revisions()
-        found = run.fit()
+        fitted = run.fit()
         stored = np.array(record.parameters_json["theta"])
-        assert np.allclose(found.theta, stored, rtol=1e-6, atol=2e-7)  # m, rad, rad/(N·m)
-        assert found.model.names == record.effects
+        assert np.allclose(fitted.theta, stored, rtol=1e-6, atol=2e-7)  # m, rad, rad/(N·m)
+        assert fitted.model.names == record.effects
     assert old.read_bytes() == before, "reading an old file must not change it"
 
 
@@ -504,8 +504,8 @@ def test_a_revision_that_another_processor_hashed(tmp_path):
         (record,) = run.file.revisions()
         assert STORED_HASH not in record.options
         elsewhere = replace(record, data_hash="0" * 64)
-        found = restore(elsewhere, run.cell, run.readings)
-        assert found.model.names == record.effects
+        restored = restore(elsewhere, run.cell, run.readings)
+        assert restored.model.names == record.effects
         with pytest.raises(InputError, match="fitted before readings were appended"):
             restore(elsewhere, run.cell, run.readings[:29])
         today = replace(elsewhere, options={**record.options, STORED_HASH: "1" * 64})

@@ -217,9 +217,9 @@ def test_three_targets_side_by_side(tmp_path):
     np.testing.assert_array_equal(x.states.target, np.tile([0, 1, 2], 11)[kept])
     np.testing.assert_array_equal(x.pose, np.repeat(np.arange(11), 3)[kept])
     assert result.notes[0] == "1 of 33 rows left out (6): no value in x1/x2/x3"
-    found = propose(path).proposal.sections
-    assert found["position"]["columns"] == names
-    assert found["position"]["targets"] == ["1", "2", "3"]
+    sections = propose(path).proposal.sections
+    assert sections["position"]["columns"] == names
+    assert sections["position"]["targets"] == ["1", "2", "3"]
     refusal(r"\[\[tool.targets\]\]", mapped, path, mapping)
 
 
@@ -253,5 +253,5 @@ def test_the_dialect_is_seen(tmp_path, w):
     named = "A1" in grid.names
     joints = Q if named else [str(c) for c in w.mapping["joints"]["columns"]]
     unit = ANGLES[w.mapping["joints"]["unit"]]
-    found = np.stack([grid.numbers(name) for name in joints], axis=1)
-    np.testing.assert_allclose(found, unit * w.q, rtol=1e-9, atol=1e-9)
+    angles = np.stack([grid.numbers(name) for name in joints], axis=1)
+    np.testing.assert_allclose(angles, unit * w.q, rtol=1e-9, atol=1e-9)

@@ -84,12 +84,12 @@ def same(found, true):
 def test_a_ball_bars_table_gives_the_true_compliances(seed, tmp_path):
     c = measured(["A", "B", "C"], seed)
     (tmp_path / "t.csv").write_text(german(c.readings))
-    found = imported(tmp_path / "t.csv", BAR | {"torques": TORQUES})
-    same(found, c.readings)
-    np.testing.assert_allclose(found.covariance, c.readings.covariance, rtol=1e-6)
-    wrench = replace(found.states, wrench=c.readings.states.wrench)  # of a load named alone
+    result = imported(tmp_path / "t.csv", BAR | {"torques": TORQUES})
+    same(result, c.readings)
+    np.testing.assert_allclose(result.covariance, c.readings.covariance, rtol=1e-6)
+    wrench = replace(result.states, wrench=c.readings.states.wrench)  # of a load named alone
     joint_std = configuration().repeatability.per_joint(6)
-    readings = with_joint_scatter(c.cell, replace(found, states=wrench), joint_std)
+    readings = with_joint_scatter(c.cell, replace(result, states=wrench), joint_std)
     fitted = fitted_model(c.cell, readings, "absolute")
     truth = true_parameters(c.world, "joint_compliance")
     compliances = [
@@ -113,10 +113,10 @@ def test_stations_and_heights_beside_distances(tmp_path):
         "std": {"values": [0.03], "unit": "mm"},
         "gauge": {"column": "Messuhr [mm]", "unit": "mm", "name": "G"},
     }
-    found = imported(tmp_path / "t.csv", BAR | more, tmp_path / "c.toml")
-    same(found, c.readings)
-    np.testing.assert_allclose(found.covariance[found.scalar, 0, 0], 1e-10, rtol=1e-6)
-    np.testing.assert_allclose(found.covariance[~found.scalar][:, 1, 1], 9e-10, rtol=1e-6)
+    result = imported(tmp_path / "t.csv", BAR | more, tmp_path / "c.toml")
+    same(result, c.readings)
+    np.testing.assert_allclose(result.covariance[result.scalar, 0, 0], 1e-10, rtol=1e-6)
+    np.testing.assert_allclose(result.covariance[~result.scalar][:, 1, 1], 9e-10, rtol=1e-6)
     refusal(r"nothing states the noise of gauge G", imported, tmp_path / "t.csv", BAR | more)
 
 
@@ -125,13 +125,13 @@ def test_a_preview_proposes_the_mapping(who, tmp_path, capsys):
     c = measured(who, 2)
     (tmp_path / "t.csv").write_text(german(c.readings))
     (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
-    found = preview_table(tmp_path / "t.csv", cell_of())
-    assert not found.proposal.missing
-    assert any('of = "load"' in words for _, words in found.proposal.doubts)
-    sections = found.proposal.sections
+    preview = preview_table(tmp_path / "t.csv", cell_of())
+    assert not preview.proposal.missing
+    assert any('of = "load"' in words for _, words in preview.proposal.doubts)
+    sections = preview.proposal.sections
     sections["torques"]["of"] = "load"
     same(imported(tmp_path / "t.csv", sections, tmp_path / "c.toml"), c.readings)
-    (tmp_path / "m.toml").write_text(found.proposal.to_toml("t.csv"))
+    (tmp_path / "m.toml").write_text(preview.proposal.to_toml("t.csv"))
     given = [tmp_path / "t.csv", "--config", tmp_path / "c.toml", "--format", tmp_path / "m.toml"]
     assert "distances from A" in " ".join(
         ok(capsys, "import", *given, "-o", tmp_path / "r.hilcal").out.split()
@@ -143,11 +143,11 @@ def test_a_table_of_joint_angles_and_one_number_without_names_is_of_distances(tm
     rows = np.column_stack([np.rad2deg(r.states.q), 1e3 * r.value[:, 0]])
     np.savetxt(tmp_path / "cable.txt", rows, fmt="%.4f")
     (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[points.A]\nstd_m = 1e-4\n")
-    found = preview_table(tmp_path / "cable.txt", cell_of())
-    assert not found.proposal.missing
-    assert {where for where, _ in found.proposal.doubts} >= {"joints", "distance"}
-    (tmp_path / "m.toml").write_text(found.proposal.to_toml("cable.txt"))
-    table = imported(tmp_path / "cable.txt", found.proposal.sections, tmp_path / "c.toml")
+    preview = preview_table(tmp_path / "cable.txt", cell_of())
+    assert not preview.proposal.missing
+    assert {where for where, _ in preview.proposal.doubts} >= {"joints", "distance"}
+    (tmp_path / "m.toml").write_text(preview.proposal.to_toml("cable.txt"))
+    table = imported(tmp_path / "cable.txt", preview.proposal.sections, tmp_path / "c.toml")
     np.testing.assert_allclose(table.value[:, 0], r.value[:, 0], atol=1e-7)
     given = [tmp_path / "cable.txt", "--config", tmp_path / "c.toml"]
     out = ok(

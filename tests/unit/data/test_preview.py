@@ -103,11 +103,11 @@ WANTED = read_toml(ROOT / "tests" / "data" / "mappings.toml")
 @pytest.mark.parametrize("case", CASES)
 def test_the_guess_is_the_mapping(case, tmp_path):
     encoding = "latin-1" if case == "german" else "utf-8"
-    found = propose(write(tmp_path / "t.csv", CASES[case], encoding)).proposal
+    proposal = propose(write(tmp_path / "t.csv", CASES[case], encoding)).proposal
     expected = check_section(WANTED[case], Mapping, "wanted")
-    assert found.mapping(Mapping).model_dump() == expected.model_dump()
-    (tmp_path / "m.toml").write_text(found.to_toml("t.csv"))
-    assert load_mapping(tmp_path / "m.toml", Mapping) == found.mapping(Mapping)
+    assert proposal.mapping(Mapping).model_dump() == expected.model_dump()
+    (tmp_path / "m.toml").write_text(proposal.to_toml("t.csv"))
+    assert load_mapping(tmp_path / "m.toml", Mapping) == proposal.mapping(Mapping)
 
 
 @pytest.mark.parametrize(
@@ -147,10 +147,10 @@ def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path):
     write(tmp_path / "tracker.csv", lines(["Point", "X", "Y", "Z"], POINTS, MM, separator=","))
     shuffled = lines(["Name", *six("A{}")], [POINTS[k] for k in order], DEG[order], comma=True)
     write(tmp_path / "robot.csv", shuffled + "P999;0;0;0;0;0;0\n")
-    found = propose(tmp_path / "tracker.csv", tmp_path / "robot.csv")
-    second = found.proposal.mapping(Mapping).second_file
+    proposed = propose(tmp_path / "tracker.csv", tmp_path / "robot.csv")
+    second = proposed.proposal.mapping(Mapping).second_file
     assert (second.match, second.separator, second.decimal) == (("Point", "Name"), ";", ",")
-    np.testing.assert_allclose(found.grid.numbers("A3"), DEG[:, 2], atol=1e-6)
+    np.testing.assert_allclose(proposed.grid.numbers("A3"), DEG[:, 2], atol=1e-6)
     one = propose(tmp_path / "tracker.csv")
     assert one.proposal.missing == [
         "no joint angles: where they are in a file of their own, give it with --second"
@@ -161,17 +161,17 @@ def test_a_missing_point(tmp_path):
     p = MM.copy()
     p[3] = p[7] = -9999
     write(tmp_path / "t.csv", lines(["X", "Y", "Z", *six("A{}")], p, DEG))
-    found = propose(tmp_path / "t.csv").proposal
-    assert found.mapping(Mapping).file.missing == (-9999.0,)
-    assert ("file", "-9999 stands for a missing point") in found.doubts
+    proposal = propose(tmp_path / "t.csv").proposal
+    assert proposal.mapping(Mapping).file.missing == (-9999.0,)
+    assert ("file", "-9999 stands for a missing point") in proposal.doubts
 
 
 def test_lines_that_are_no_readings(tmp_path):
     text = "Tracker report\n\n" + lines([*six("A{}"), "X", "Y", "Z"], DEG, MM) + "end;of;file\n\n\n"
-    found = propose(write(tmp_path / "t.csv", text))
-    assert found.proposal.mapping(Mapping).file.header_row == 3
-    assert len(found.grid.rows) == N
-    assert any("are left out" in words for _, words in found.proposal.doubts)
+    proposed = propose(write(tmp_path / "t.csv", text))
+    assert proposed.proposal.mapping(Mapping).file.header_row == 3
+    assert len(proposed.grid.rows) == N
+    assert any("are left out" in words for _, words in proposed.proposal.doubts)
 
 
 def test_the_header_again_and_figures_of_all_rows_at_the_end(tmp_path):
@@ -181,9 +181,9 @@ def test_the_header_again_and_figures_of_all_rows_at_the_end(tmp_path):
     rows = lines(header, POINTS, DEG, MM, times, comma=True).splitlines()
     rows[10:10] = rows[:1]
     rows.append(";".join(["Mittel", *[""] * 6, "1,0", "2,0", "3,0", ""]))
-    found = propose(write(tmp_path / "t.csv", "\n".join(rows)))
-    assert found.proposal.mapping(Mapping).time.format == "%d.%m.%Y %H:%M:%S"
-    assert ("file", f"rows 11 are left out: {NOT_READINGS}") in found.proposal.doubts
+    proposed = propose(write(tmp_path / "t.csv", "\n".join(rows)))
+    assert proposed.proposal.mapping(Mapping).time.format == "%d.%m.%Y %H:%M:%S"
+    assert ("file", f"rows 11 are left out: {NOT_READINGS}") in proposed.proposal.doubts
 
 
 NOT_READINGS = "they repeat the header or are not of the table's length"
@@ -205,8 +205,8 @@ def test_a_load_in_one_column_is_read_in_its_unit(name, section, tmp_path):
 @pytest.mark.parametrize(("angles", "from_zero"), [(DEG % 360, True), (DEG, False)])
 def test_angles_counted_from_zero_are_noticed(angles, from_zero, tmp_path):
     text = lines([*six("A{}"), "X", "Y", "Z"], angles, MM)
-    found = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
-    assert found.joints.from_zero is from_zero
+    mapping = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
+    assert mapping.joints.from_zero is from_zero
 
 
 def test_columns_of_several_units_are_said_so(tmp_path):
@@ -265,10 +265,10 @@ def test_angles_beside_encoder_counts_are_read(tmp_path):
 def test_commanded_positions_are_not_taken_for_measured_ones(names, tmp_path):
     nominal, measured = ([name.replace("X", "{}").format(e) for e in "XYZ"] for name in names)
     text = lines([*nominal, *six("A{}"), *measured], MM + 3.0, DEG, MM)
-    found = propose(write(tmp_path / "t.csv", text)).proposal
+    proposal = propose(write(tmp_path / "t.csv", text)).proposal
     plain = names[1] == "T{}"  # the names do not tell: said
-    assert found.sections["position"]["columns"] == (nominal if plain else measured)
-    assert any("are used, not 'TX'" in words for _, words in found.doubts) is plain
+    assert proposal.sections["position"]["columns"] == (nominal if plain else measured)
+    assert any("are used, not 'TX'" in words for _, words in proposal.doubts) is plain
 
 
 @pytest.mark.parametrize("repeated", [False, True])
@@ -277,9 +277,9 @@ def test_names_over_several_columns_tell_those_of_one_name_apart(repeated, tmp_p
     over = [*[""] * 7, *["Nominal [mm]", *2 * ["Nominal [mm]" * repeated]]]
     over += ["Measured [mm]", *2 * ["Measured [mm]" * repeated]]
     text = ";".join(over) + "\n" + lines(header, POINTS, DEG, MM + 3.0, MM)
-    found = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
-    assert found.position.columns == tuple(f"Measured [mm] {e}" for e in "XYZ")
-    assert (found.file.group_row, found.file.header_row) == (1, 2)
+    mapping = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
+    assert mapping.position.columns == tuple(f"Measured [mm] {e}" for e in "XYZ")
+    assert (mapping.file.group_row, mapping.file.header_row) == (1, 2)
 
 
 @pytest.mark.parametrize(("names", "figure", "section"), [
@@ -301,8 +301,8 @@ def test_uncertainties_are_in_their_own_unit(names, figure, section, tmp_path):
     header = [*six("A{}"), "X [mm]", "Y [mm]", "Z [mm]", *names]
     text = lines(header, DEG, MM, figures.reshape(N, -1), digits=12)
     sections = propose(write(tmp_path / "t.csv", text)).proposal.sections
-    found = {k: v["unit"] for k, v in sections.items() if k in ("std", "covariance")}
-    assert found == section
+    units = {k: v["unit"] for k, v in sections.items() if k in ("std", "covariance")}
+    assert units == section
     assert sections.get("std", {}).get("kind", "std") == "variance" if "²" in names[0] else "std"
 
 
@@ -332,8 +332,8 @@ def test_times_over_midnight(forms, tmp_path):
     names = ["Date", "Time"][-len(forms) :]
     texts = [[t.strftime(form) for t in stamps] for form in forms]
     text = lines([*names, *six("A{}"), "X", "Y", "Z"], *texts, DEG, MM)
-    found = propose(write(tmp_path / "t.csv", text))
-    values, midnights = seconds(found.grid, found.proposal.mapping(Mapping).time)
+    proposed = propose(write(tmp_path / "t.csv", text))
+    values, midnights = seconds(proposed.grid, proposed.proposal.mapping(Mapping).time)
     np.testing.assert_allclose(values, 300.0 * np.arange(N))
     assert midnights == (forms == ("%H:%M:%S",))
 
@@ -351,9 +351,9 @@ def test_names_of_rows_are_not_those_of_poses(numbers, tmp_path):
     names = np.arange(1, 2 * N + 1) if numbers else [f"M{k}" for k in range(2 * N)]
     twice = (np.repeat(values, 2, axis=0) for values in (DEG, MM))
     text = lines(["No.", *six("A{}"), "X", "Y", "Z", "Load"], names, *twice, N * ["none", "5 kg"])
-    found = propose(write(tmp_path / "t.csv", text)).proposal
-    assert "pose" not in found.sections
-    assert [words.split(":")[0] for about, words in found.doubts if about == "pose"] == [
+    proposal = propose(write(tmp_path / "t.csv", text)).proposal
+    assert "pose" not in proposal.sections
+    assert [words.split(":")[0] for about, words in proposal.doubts if about == "pose"] == [
         "'No.' names rows, not poses"
     ]
 
@@ -366,9 +366,9 @@ def test_reflectors_row_by_row(whole, tmp_path):
     four = (np.repeat(values, 4, axis=0) for values in (DEG, MM))
     header = ["Pose", "Point", "Load", *six("A{}"), "X", "Y", "Z"]
     text = lines(header, [p for p in POINTS for _ in range(4)], label, loads, *four)
-    found = propose(write(tmp_path / "t.csv", text)).proposal.sections
-    assert found["pose"]["column"] == "Pose"
-    assert ("target" in found) is whole
+    sections = propose(write(tmp_path / "t.csv", text)).proposal.sections
+    assert sections["pose"]["column"] == "Pose"
+    assert ("target" in sections) is whole
 
 
 def test_distances_that_stand_side_by_side_are_said_not_to_be_read(tmp_path):

@@ -121,10 +121,10 @@ def test_tables_and_files_keep_the_targets(tmp_path_factory, target):
         file.append_readings(one[:1])
         file.append_readings(one[1:])
         stored = file.readings()
-    for found in (back, stored):
-        assert found.target_names == NAMES
-        np.testing.assert_array_equal(found.target, target)
-        assert content_hash(found) == content_hash(one)
+    for copy in (back, stored):
+        assert copy.target_names == NAMES
+        np.testing.assert_array_equal(copy.target, target)
+        assert content_hash(copy) == content_hash(one)
 
 
 def test_a_campaign_numbers_targets_by_their_names(tmp_path):

@@ -176,8 +176,8 @@ def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing
     connection.execute("CREATE TABLE t (x)")
     interrupted = [transaction(connection) for _ in range(2)]
     interrupted[0].__enter__().execute("INSERT INTO t VALUES (1)")
-    with transaction(connection) as found:
-        found.execute("INSERT INTO t VALUES (2)")
+    with transaction(connection) as begun:
+        begun.execute("INSERT INTO t VALUES (2)")
     assert connection.execute("SELECT x FROM t").fetchall() == [(2,)]
     interrupted[1].__enter__()
     connection.close()

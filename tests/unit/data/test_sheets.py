@@ -71,9 +71,9 @@ def book(path):
 def test_a_spreadsheet(tmp_path, arm):
     path = tmp_path / "t.xlsx"
     book(path)
-    found = propose(path).proposal.mapping(Mapping)
-    assert (found.file.sheet, found.file.header_row) == ("Data", 3)
-    x = read(path, found, arm)
+    mapping = propose(path).proposal.mapping(Mapping)
+    assert (mapping.file.sheet, mapping.file.header_row) == ("Data", 3)
+    x = read(path, mapping, arm)
     np.testing.assert_allclose(x.states.q, C.q, atol=1e-12)
     np.testing.assert_allclose(x.value, C.position, atol=1e-12)
     np.testing.assert_allclose(x.states.time, 30 * np.arange(12))
@@ -126,9 +126,9 @@ def test_parquet(tmp_path, arm):
     columns["pose"] = [f"P{k}" for k in range(12)]
     columns["raw"] = [[1.0, 2.0]] * 12
     parquet.write_table(pyarrow.table(columns), path)
-    found = propose(path).proposal.mapping(Mapping)
-    assert found == section(pose={"column": "pose"})
-    np.testing.assert_allclose(read(path, found, arm).value, C.position)
+    mapping = propose(path).proposal.mapping(Mapping)
+    assert mapping == section(pose={"column": "pose"})
+    np.testing.assert_allclose(read(path, mapping, arm).value, C.position)
 
 
 def test_a_second_sheet_of_readings_is_said_to_be_left_out(tmp_path):
@@ -136,8 +136,8 @@ def test_a_second_sheet_of_readings_is_said_to_be_left_out(tmp_path):
     out = openpyxl.load_workbook(tmp_path / "t.xlsx")
     out.copy_worksheet(out["Data"]).title = "Tuesday"
     out.save(tmp_path / "t.xlsx")
-    found = propose(tmp_path / "t.xlsx").proposal
-    assert ("file", "only this sheet is read, and not Tuesday") in found.doubts
+    proposal = propose(tmp_path / "t.xlsx").proposal
+    assert ("file", "only this sheet is read, and not Tuesday") in proposal.doubts
 
 
 def _zip(**members):
@@ -200,9 +200,9 @@ def test_merged_cells_and_numbers_as_texts(tmp_path, arm):
         if k % 6 == 0:
             sheet.merge_cells(start_row=k + 2, end_row=k + 7, start_column=1, end_column=1)
     out.save(tmp_path / "t.xlsx")
-    found = propose(tmp_path / "t.xlsx").proposal.mapping(Mapping)
-    assert (found.file.decimal, found.pose.column) == (",", "Pose")
-    x = read(tmp_path / "t.xlsx", found, arm)
+    mapping = propose(tmp_path / "t.xlsx").proposal.mapping(Mapping)
+    assert (mapping.file.decimal, mapping.pose.column) == (",", "Pose")
+    x = read(tmp_path / "t.xlsx", mapping, arm)
     assert [x.load_names[k] for k in x.load] == 4 * [*3 * ["none"], *3 * ["5 kg"]]
     assert x.pose_names == ("P0", "P1", "P2", "P3")
     np.testing.assert_allclose(x.states.q, np.repeat(C.q[:4], 6, axis=0), atol=2e-8)

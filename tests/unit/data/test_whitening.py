@@ -82,8 +82,8 @@ def test_the_mean_keeps_the_expected_share_of_what_is_stated():
     basis = np.sqrt((samples - 1) * (1 - share)) * np.linalg.cholesky(stated).T
     scatter = np.vstack([basis, np.zeros((samples - 3, 3))])
     expected = expected_share_of_mean(samples, share) * stated
-    found = covariance_of_mean(stated, scatter, share)
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-24)
+    covariance = covariance_of_mean(stated, scatter, share)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12, atol=1e-24)
 
 
 seeds = st.integers(0, 2**32 - 1)

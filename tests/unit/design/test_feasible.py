@@ -306,11 +306,13 @@ def test_what_hangs_is_seen_by_the_dry_run():
     config = cell(obstacles=[TABLE], limits=limits)
     up = (0.0, -1.2, 1.5, -1.9, 1.57, 0.0)  # the load point above the wrist
     assert problems(config, HOME, up) == ()
-    found = problems(config, HOME, up, load="5kg")
-    assert any("wrist 3 and what hangs (5kg) collide" in line for line in found), found
+    refusals = problems(config, HOME, up, load="5kg")
+    assert any("wrist 3 and what hangs (5kg) collide" in line for line in refusals), refusals
     long = [{"name": "5kg", "mass_kg": 5.0, "hang_m": 1.5}]
-    found = problems(cell(limits=limits, loads=long), HOME, HOME, load="5kg")
-    assert any("what hangs (5kg) is" in line and "outside the workspace" in line for line in found)
+    refusals = problems(cell(limits=limits, loads=long), HOME, HOME, load="5kg")
+    assert any(
+        "what hangs (5kg) is" in line and "outside the workspace" in line for line in refusals
+    )
 
 
 def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run():
@@ -478,9 +480,13 @@ def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
         at, parts = frames(c.arm, between), space.shapes.scene.parts
         for point in (placed(parts[-1], at)[-1], at[4][:3, 3]):
             cube = {"name": "cube", "center_m": point.tolist(), "size_m": [0.004] * 3}
-            found = cell(limits=free.limits.model_dump(), obstacles=[cube])
-            assert not FeasibleSpace(c.with_config(found)).passable(start, end[None], load).any()
-            problems = route_problems(Feasibility(c.with_config(found)), _way(start, end, load))
+            obstructed = cell(limits=free.limits.model_dump(), obstacles=[cube])
+            assert (
+                not FeasibleSpace(c.with_config(obstructed)).passable(start, end[None], load).any()
+            )
+            problems = route_problems(
+                Feasibility(c.with_config(obstructed)), _way(start, end, load)
+            )
             assert any("cube collide" in x for x in problems)
         low, _ = extent([p for p in parts if p.body > 2], c, between[None])
         box = free.limits.model_dump() | {"workspace_min_m": [-9.0, -9.0, low[2] + 0.002]}

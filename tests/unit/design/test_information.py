@@ -66,12 +66,12 @@ def test_prediction_is_what_identification_states(mode, known):
     # An unknown registration is planned with the tracker about where it stands.
     c = campaign(mode=mode, poses=16, seed=3, registration_known=known)
     config = config_of(mode)
-    found = fitted_model(c.cell, c.readings, mode)
+    fitted = fitted_model(c.cell, c.readings, mode)
     if not known:
         r = c.world.registration
         place = tuple(float(x) for x in -r[:3, :3].T @ r[:3, 3])
         config = changed(config, sight={"tracker_m": place})
-    as_stated(c, config, found, 0.01 if known else 0.05, JOINTS)
+    as_stated(c, config, fitted, 0.01 if known else 0.05, JOINTS)
 
 
 JOINTS = tuple(f"joint_compliance.j{k}" for k in range(1, 7))
@@ -165,16 +165,16 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
 @pytest.mark.parametrize("mode", MODES)
 def test_what_was_measured_is_known_exactly(mode):
     c = campaign(mode=mode, poses=12, seed=1, target_known=False)
-    found = fitted_model(c.cell, c.readings, mode)
+    fitted = fitted_model(c.cell, c.readings, mode)
     config = config_of(mode)
-    p = problem(model_after(found, config), config, poses_of(3))
+    p = problem(model_after(fitted, config), config, poses_of(3))
     uncertainty = predicted_uncertainty(p)
-    flat = np.isinf(found.solution.prior)
-    ratio = (uncertainty.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
+    flat = np.isinf(fitted.solution.prior)
+    ratio = (uncertainty.std / fitted.uncertainty.formal)[flat & fitted.uncertainty.identifiable]
     assert ratio == pytest.approx(np.ones(len(ratio)), rel=1e-6)
-    assert np.isinf(uncertainty.std[flat & ~found.uncertainty.identifiable]).all()
+    assert np.isinf(uncertainty.std[flat & ~fitted.uncertainty.identifiable]).all()
     identified = np.isfinite(uncertainty.std)
-    assert np.all(identified == found.uncertainty.identifiable)
+    assert np.all(identified == fitted.uncertainty.identifiable)
 
 
 def test_planning_on_predicts_the_fit_to_all_readings():
@@ -188,8 +188,8 @@ def test_planning_on_predicts_the_fit_to_all_readings():
     begun = fitted_model(cell, first, "absolute", effects)
     later = problem(model_after(begun, config), config, poses_of(20, 8)[8:])
     expected = predicted_uncertainty(later, everything_once(later))
-    found = fitted_model(cell, readings, "absolute", effects)
-    assert expected.std == pytest.approx(found.uncertainty.formal, rel=0.02)
+    fitted = fitted_model(cell, readings, "absolute", effects)
+    assert expected.std == pytest.approx(fitted.uncertainty.formal, rel=0.02)
     # The potential terms were measured as well: what is known of all together.
     wider = (*effects, "joint_stiffening")
     whole = fitted_model(cell, readings, "absolute", wider)
@@ -201,8 +201,8 @@ def test_planning_on_predicts_the_fit_to_all_readings():
 
 def test_a_fit_that_is_not_whitened_is_refused():
     c = campaign(mode="absolute", poses=8, registration_known=True)
-    found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    refusal("scaling gc, this one has none", model_after, found, config_of())
+    fitted = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
+    refusal("scaling gc, this one has none", model_after, fitted, config_of())
 
 
 @pytest.mark.parametrize("m", first(1, [3, 6]))
@@ -430,8 +430,8 @@ CARRIED = ("joint_compliance", "joint_tilt_compliance")
 @cache
 def learnt():
     c = campaign("joint_tilt_compliance", "absolute", 1, poses=30, registration_known=True)
-    found = fitted_model(c.cell, c.readings, "absolute", CARRIED)
-    return Posterior.of(found)
+    fitted = fitted_model(c.cell, c.readings, "absolute", CARRIED)
+    return Posterior.of(fitted)
 
 
 def problem_with(prior, names=CARRIED):
@@ -453,8 +453,8 @@ def test_what_is_known_is_in_the_prediction():
 
 
 def test_effects_that_only_the_prior_knows_are_planned_for():
-    found = problem_with(carried_prior(learnt()), CARRIED[:1])
-    assert "joint_tilt_compliance" in found.nominal.model.names
+    result = problem_with(carried_prior(learnt()), CARRIED[:1])
+    assert "joint_tilt_compliance" in result.nominal.model.names
 
 
 def test_a_prior_that_knows_nothing_changes_no_prediction():

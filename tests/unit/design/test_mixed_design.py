@@ -32,8 +32,10 @@ STD_RAD = 2e-5
 
 
 def config(mode):
-    found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
-    return changed(found, repeatability={"joint_std_rad": STD_RAD})
+    cell_config = config_of(
+        mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg"
+    )
+    return changed(cell_config, repeatability={"joint_std_rad": STD_RAD})
 
 
 def scene(mode, *, fitted):
@@ -127,10 +129,10 @@ def test_what_is_predicted_counts_the_directions_that_are_left_out(monkeypatch, 
 @pytest.mark.long
 def test_a_plan_after_a_fit_of_another_arm_is_refused():
     c = campaign(mode="absolute", poses=8, seed=3, registration_known=True)
-    found = fitted_model(c.cell, c.readings, "absolute")
+    fitted = fitted_model(c.cell, c.readings, "absolute")
     other = changed(config("absolute"), robot={"model": "ur5e"})
     with pytest.raises(InputError, match="of the arm ur10e, whose nominal links differ"):
-        plan_readings(cell_from_config(other), PlanRequest(4), np.random.default_rng(0), found)
+        plan_readings(cell_from_config(other), PlanRequest(4), np.random.default_rng(0), fitted)
 
 
 def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
@@ -147,8 +149,8 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     counts = np.ones(len(of.units))
     variances = [variance_of(d, counts) for d in (plain, balanced(uneven))]
     assert variances[1] == pytest.approx(variances[0], rel=1e-6)
-    found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
-    assert found[1] == pytest.approx(found[0], rel=1e-4)
+    relaxed = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
+    assert relaxed[1] == pytest.approx(relaxed[0], rel=1e-4)
 
 
 @pytest.mark.long

@@ -115,14 +115,17 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
         PlanRequest(6),
         rng,
     )
-    found = plan_separating(*asked, reference=first.plan.joints("reference"))
-    of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
+    separating_plan = plan_separating(*asked, reference=first.plan.joints("reference"))
+    of, known = (
+        separating_plan.planned.problem,
+        discriminated_pairs(separating_plan.planned.problem).prior,
+    )
     values, vectors = np.linalg.eigh(known)
     before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    planned = np.repeat(of.units.rows, found.planned.counts.astype(int), axis=0)
+    planned = np.repeat(of.units.rows, separating_plan.planned.counts.astype(int), axis=0)
     every = np.vstack([before, planned.reshape(-1, of.units.size)])
     supported = supported_parameters(of, DRAWS)
-    for p in found.powers:
+    for p in separating_plan.powers:
         where, rival = of.of_effect(p.effect), of.of_effect(p.rival)
         fitted = np.concatenate([np.arange(of.model_size), rival])
         beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
@@ -141,19 +144,19 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
 
 def told(effect, strength, seed=2):
     c = campaign(effect, "deflection", seed, poses=10, strength=strength)
-    found = fitted_model(c.cell, c.readings, "deflection")
+    fitted = fitted_model(c.cell, c.readings, "deflection")
     config = config_of("deflection", against=(effect, LINK))
-    of = problem(model_after(found, config), config, poses_of(10, 1000 + seed))
-    return found, true_parameters(c.world, effect), of
+    of = problem(model_after(fitted, config), config, poses_of(10, 1000 + seed))
+    return fitted, true_parameters(c.world, effect), of
 
 
 def test_an_estimate_holds_the_true_parameters():
-    found, true, of = told(TILT, 4.0)
-    linear, effect = linearise(found), next(e for e in of.families if e.name == TILT)
+    fitted, true, of = told(TILT, 4.0)
+    linear, effect = linearise(fitted), next(e for e in of.families if e.name == TILT)
     drawn = posterior_draws(linear, effect, 4000)
     off, spread = drawn[0] - true, np.cov(drawn[1:].T)
     assert off @ np.linalg.solve(spread, off) < stats.chi2.isf(1e-4, len(true))
-    columns = effect_columns(found, effect)
+    columns = effect_columns(fitted, effect)
     score = linear.score(columns.white, largest=effect.most())
     np.testing.assert_allclose(drawn[0], columns.scale * score.step, rtol=1e-12)
     stated = columns.scale * np.linalg.norm(score.root, axis=1)
@@ -161,12 +164,12 @@ def test_an_estimate_holds_the_true_parameters():
 
 
 def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
-    found, _, of = told("hysteresis", 0.0)
-    assert posterior_draws(linearise(found), of.families[0], 3) is None
-    blind = replace(found.solution.prediction.situation.states, approach=None)
-    situation = replace(found.solution.prediction.situation, states=blind)
-    prediction = replace(found.solution.prediction, situation=situation)
-    without = replace(found, solution=replace(found.solution, prediction=prediction))
+    fitted, _, of = told("hysteresis", 0.0)
+    assert posterior_draws(linearise(fitted), of.families[0], 3) is None
+    blind = replace(fitted.solution.prediction.situation.states, approach=None)
+    situation = replace(fitted.solution.prediction.situation, states=blind)
+    prediction = replace(fitted.solution.prediction, situation=situation)
+    without = replace(fitted, solution=replace(fitted.solution, prediction=prediction))
     hysteresis = next(e for e in of.families if e.name == "hysteresis")
     assert posterior_draws(linearise(without), hysteresis, 3) is None
 
@@ -198,13 +201,13 @@ def test_what_was_ambiguous_is_decided():
     first = doubtful("base_compliance", 2)
     assert "base_compliance" in first.suspects
     assert len(first.suspects) > 1
-    d, found = after_further_plan(first)
-    assert all(t.power_planned > t.power_now for t in found.powers)
+    d, separating_plan = after_further_plan(first)
+    assert all(t.power_planned > t.power_now for t in separating_plan.powers)
     assert (d.suspects[0].effect, d.suspects[0].same_as) == ("base_compliance", ())
-    plan = found.planned.ordered.plan
-    assert found.planned.design.efficiency > 0.9
-    assert set(found.shares) <= set(plan.loads)
-    assert sum(found.shares.values()) == pytest.approx(1.0)
+    plan = separating_plan.planned.ordered.plan
+    assert separating_plan.planned.design.efficiency > 0.9
+    assert set(separating_plan.shares) <= set(plan.loads)
+    assert sum(separating_plan.shares.values()) == pytest.approx(1.0)
 
 
 @pytest.mark.slow
@@ -239,13 +242,13 @@ def case(mode):
     """A fit without tilting joints, which are there, and the design problem after it."""
     c = campaign(TILT, mode, 3, poses=10, strength=2.0, plan_seed=21)
     model = baseline(c.cell, c.readings, mode)
-    found = fit(model, c.readings, mode)
+    fitted = fit(model, c.readings, mode)
     # A fit keeps the rows of its last linearisation, a negligible step before its minimum; those of
     # one that begins there, twice, are of the minimum, as the plan's are.
     for _ in range(2):
-        found = fit(model, c.readings, mode, start=found.theta)
+        fitted = fit(model, c.readings, mode, start=fitted.theta)
     config = config_of(mode, against=(TILT, LINK))
-    return found, problem(model_after(found, config), config, poses_of(8, 21))
+    return fitted, problem(model_after(fitted, config), config, poses_of(8, 21))
 
 
 def columns(of, found):
@@ -256,8 +259,8 @@ def columns(of, found):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
-    found, of = case(mode)
-    linear, x = linearise(found), columns(of, found)
+    result, of = case(mode)
+    linear, x = linearise(result), columns(of, result)
     so_far = discriminated_pairs(of).prior
     model = np.arange(of.model_size)
     for name, white in x.items():
@@ -276,9 +279,9 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_evidence_and_estimates_of_suspects(mode):
-    found, of = case(mode)
-    linear = linearise(found)
-    ranked = {s.effect: s.score for s in rank_suspects(linear, candidates(found))}
+    result, of = case(mode)
+    linear = linearise(result)
+    ranked = {s.effect: s.score for s in rank_suspects(linear, candidates(result))}
     for family in of.families:
         score, scale = ranked[family.name], np.array([p.scale for p in family.parameters])
         drawn = posterior_draws(linear, family, 3)  # the diagnosis' evidence supports the effect

@@ -234,16 +234,16 @@ LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
 )
 def test_known_optima(criterion, degree, expected):
     """Pukelsheim (1993), ch. 9; Fedorov (1972)."""
-    found = relax(asked(polynomial(degree, LEGENDRE), criterion), 10.0, tolerance=1e-8)
-    shares = at(LEGENDRE, found)
+    relaxed = relax(asked(polynomial(degree, LEGENDRE), criterion), 10.0, tolerance=1e-8)
+    shares = at(LEGENDRE, relaxed)
     assert sorted(shares) == pytest.approx(sorted(expected), abs=1e-9)
     for x, share in expected.items():
         near = min(shares, key=lambda y, x=x: abs(y - x))
         assert shares[near] == pytest.approx(share, abs=2e-3)
     points, exact = (np.array(list(x)) for x in (expected, expected.values()))
     m = 10.0 * polynomial(degree, points).information(exact)
-    assert found.value == pytest.approx(float(criterion.value(m)), rel=1e-6)
-    assert found.value * (1 - 1e-9) <= found.bound <= found.value * (1 + 1e-6)
+    assert relaxed.value == pytest.approx(float(criterion.value(m)), rel=1e-6)
+    assert relaxed.value * (1 - 1e-9) <= relaxed.bound <= relaxed.value * (1 + 1e-6)
 
 
 @every_of_three
@@ -317,16 +317,16 @@ def test_tiny_plans_against_all_plans(name):
 def test_many_units(most):
     """Columns are generated until the equivalence theorem holds for all units."""
     units = random_units(3, 20_000, 8)
-    found = relax(asked(units, D()), 40.0, max_weight=most)
-    assert found.gap <= 1e-6
-    inverse = np.linalg.inv(units.information(found.weight, found.index))
+    relaxed = relax(asked(units, D()), 40.0, max_weight=most)
+    assert relaxed.gap <= 1e-6
+    inverse = np.linalg.inv(units.information(relaxed.weight, relaxed.index))
     leverage = np.einsum("krp,pq,krq->k", units.rows, inverse, units.rows)
     if most is None:
         assert leverage.max() <= 8 / 40.0 * (1 + 1e-5)
     else:
-        assert found.weight.max() <= 1 + 1e-9
+        assert relaxed.weight.max() <= 1 + 1e-9
         top = np.sort(leverage)[-40:].sum()  # the 40 best once each
-        assert found.value * top / 8 <= found.value * (1 + 1e-5)
+        assert relaxed.value * top / 8 <= relaxed.value * (1 + 1e-5)
 
 
 def test_budget_too_small_for_the_parameters():

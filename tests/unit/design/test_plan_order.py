@@ -345,9 +345,9 @@ def test_loops_are_cut_in_least_time(count, seed, limit):
     for bits in range(2 ** (count - 1)):
         cuts = [0, *(k + 1 for k in range(count - 1) if bits >> k & 1), count]
         tries.append([order[a:b] for a, b in pairwise(cuts)])
-    found = tour.loops(w, order, 6.5, limit)
-    assert [k for part in found for k in part] == order
-    assert cost(found) == pytest.approx(min(map(cost, tries)), rel=1e-12)
+    loops = tour.loops(w, order, 6.5, limit)
+    assert [k for part in loops for k in part] == order
+    assert cost(loops) == pytest.approx(min(map(cost, tries)), rel=1e-12)
 
 
 def test_random_orders_are_uniform_and_within_the_budget():

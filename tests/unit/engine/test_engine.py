@@ -43,7 +43,7 @@ def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody
         with pytest.raises(ValueError, match="item 3 is odd"):
             engine.map(refuse, range(6))
         large = [np.full(200_000, k) for k in range(6)]  # more than a pipe holds
-        assert [found[-1] for found in engine.map(negative, large)] == [-k for k in range(6)]
+        assert [results[-1] for results in engine.map(negative, large)] == [-k for k in range(6)]
         turned = [np.zeros((2, 3, 4)).transpose(axes) for axes in permutations(range(3))]
         assert engine.map(strides, turned) == tuple(map(strides, turned))
     assert not workers()
@@ -70,8 +70,8 @@ def sockets():
 @pytest.mark.long
 def test_what_a_killed_worker_held_is_computed_by_another(tmp_path):
     with open_engine(2) as engine:
-        found = engine.map(partial(die_once, folder=tmp_path), range(6))
-        assert found == tuple(range(6))
+        results = engine.map(partial(die_once, folder=tmp_path), range(6))
+        assert results == tuple(range(6))
         assert len(list(tmp_path.iterdir())) == 2
         with pytest.raises(ClusterError, match=r"ended 4 workers") as ended:
             engine.map(partial(die_once, folder=tmp_path / "none"), range(6))
@@ -206,8 +206,8 @@ def scheduler(protocol="tcp"):
     command = ("dask", "scheduler", *host, "--port", "0", "--no-dashboard")
     with running(*command, "--dashboard-address", "127.0.0.1:0") as process:
         for line in process.stderr:
-            if found := re.search(r"Scheduler at:\s*(\w+://127\S+)", line):
-                yield found[1]
+            if match := re.search(r"Scheduler at:\s*(\w+://127\S+)", line):
+                yield match[1]
                 return
     pytest.fail("no scheduler")
 

@@ -42,18 +42,18 @@ def test_a_good_plan_passes():
 def test_a_plan_of_another_arm():
     bench, plan = Bench(), usual_plan()
     assert problems(bench, replace(plan, about={"robot": bench.cell.arm.name})) == ()
-    (found,) = problems(bench, replace(plan, about={"robot": "ur3e"}))
-    assert f"made for ur3e, and the cell's arm is {bench.cell.arm.name}" in found
+    (refusals,) = problems(bench, replace(plan, about={"robot": "ur3e"}))
+    assert f"made for ur3e, and the cell's arm is {bench.cell.arm.name}" in refusals
 
 
 def test_number_of_joints_and_names_of_loads_at_once():
     bench = Bench()
     plan = Plan(("a",), np.zeros((1, 7)), (Step("a", "none"), Step("a", "3 kg")))
-    found = problems(bench, plan)
-    assert len(found) == 2
-    assert "7 joint angles" in found[0]
-    assert '"3 kg"' in found[1]
-    assert 'did you mean "3kg"' in found[1]
+    refusals = problems(bench, plan)
+    assert len(refusals) == 2
+    assert "7 joint angles" in refusals[0]
+    assert '"3 kg"' in refusals[1]
+    assert 'did you mean "3kg"' in refusals[1]
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -66,8 +66,8 @@ def test_joint_limit_with_margin(joint, side):
         q = np.array(POSES["reference"])
         q[joint] = limit - side * inside
         poses = {"reference": POSES["reference"], "edge": tuple(q)}
-        found = problems(bench, plan_of(("edge", "none", 0), poses=poses))
-        assert any(arm.joint_names[joint] in line and "edge" in line for line in found) is wrong
+        refusals = problems(bench, plan_of(("edge", "none", 0), poses=poses))
+        assert any(arm.joint_names[joint] in line and "edge" in line for line in refusals) is wrong
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -109,9 +109,9 @@ def test_workspace_is_checked_along_the_whole_path(axis, side):
             b[axis] = float(high[axis]) - narrower
         limits = Limits(workspace_min_m=tuple(a), workspace_max_m=tuple(b))
         bench.config = bench.config.model_copy(update={"limits": limits})
-        found = problems(bench, plan)
-        assert bool(found) is wrong
-        assert all(f"whose {'xyz'[axis]} ends" in line for line in found)
+        refusals = problems(bench, plan)
+        assert bool(refusals) is wrong
+        assert all(f"whose {'xyz'[axis]} ends" in line for line in refusals)
 
 
 def test_torque_under_load_names_pose_load_joint_and_limit():
@@ -127,9 +127,9 @@ def test_torque_under_load_names_pose_load_joint_and_limit():
     light = plan_of(("stretched", "none", 0), ("stretched", "light", 0), poses=poses)
     assert problems(bench, light) == ()
     heavy = plan_of(("stretched", "none", 0), ("stretched", "pull", 0), poses=poses)
-    found = [line for line in problems(bench, heavy) if "bears" in line]
-    assert any("stretched under pull" in line and "shoulder_lift" in line for line in found)
-    assert any("0.9 of 330" in line for line in found)
+    refusals = [line for line in problems(bench, heavy) if "bears" in line]
+    assert any("stretched under pull" in line and "shoulder_lift" in line for line in refusals)
+    assert any("0.9 of 330" in line for line in refusals)
 
 
 def test_what_hangs_is_checked_on_the_way_too_and_in_the_beam():
@@ -143,8 +143,8 @@ def test_what_hangs_is_checked_on_the_way_too_and_in_the_beam():
     plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1), poses=poses)
     x, y, z = middle
     stand = Obstacle(name="stand", bottom_m=(x, y, 0.0), radius_m=0.02, height_m=z - 0.08)
-    found = problems(Bench(limits=WIDE, obstacles=(stand,)), plan)
-    assert [line.partition(":")[0] for line in found] == [
+    refusals = problems(Bench(limits=WIDE, obstacles=(stand,)), plan)
+    assert [line.partition(":")[0] for line in refusals] == [
         "between reference and p1",
         "between p1 and reference",
     ]
@@ -156,19 +156,19 @@ def test_what_hangs_is_checked_on_the_way_too_and_in_the_beam():
 def test_payload_counts_tool_and_load(mass, wrong):
     sensor = ForceSensor(driver="x", port="y", max_force_N=1e3, max_moment_Nm=1e3)
     bench = Bench(loads=(CellLoad(name="heavy", mass_kg=mass),), force_sensor=sensor)
-    found = problems(bench, plan_of(("p1", "none", 0), ("p1", "heavy", 0)))
-    assert any("payload" in line and "heavy" in line for line in found) is wrong
+    refusals = problems(bench, plan_of(("p1", "none", 0), ("p1", "heavy", 0)))
+    assert any("payload" in line and "heavy" in line for line in refusals) is wrong
 
 
 def test_what_force_sensor_and_arm_bear():
     sensor = ForceSensor(driver="x", port="y", max_force_N=50.0, max_moment_Nm=3.0)
     bench = Bench(force_sensor=sensor)
-    found = problems(bench, plan_of(("p1", "none", 0), ("p1", "6kg", 0)))
-    assert any("max_force_N is 50" in line for line in found)
-    assert any("max_moment_Nm is 3" in line and "p1 under 6kg" in line for line in found)
+    refusals = problems(bench, plan_of(("p1", "none", 0), ("p1", "6kg", 0)))
+    assert any("max_force_N is 50" in line for line in refusals)
+    assert any("max_moment_Nm is 3" in line and "p1 under 6kg" in line for line in refusals)
     bench = Bench(loads=(CellLoad(name="pull", force_N=(150.0, 0.0, 0.0)),), limits=WIDE)
-    found = problems(bench, plan_of(("p1", "none", 0), ("p1", "pull", 0)))
-    assert not any("payload" in line for line in found)
+    refusals = problems(bench, plan_of(("p1", "none", 0), ("p1", "pull", 0)))
+    assert not any("payload" in line for line in refusals)
     bench = Bench(tool=Tool(mass_kg=13.0))
     assert any("the tool is 13 kg" in p for p in problems(bench, plan_of(("p1", "none", 0))))
 
@@ -194,11 +194,11 @@ def test_all_problems_at_once_and_each_once():
     limits = Limits(workspace_min_m=(-3, -3, 0.6), joint_speed_rad_s=0.1, torque_share=0.05)
     bench = Bench(limits=limits)
     plan = plan_of(*((p, load, 0) for load in ("none", "6kg", "brick") for p in POSES))
-    found = problems(bench, plan)
+    refusals = problems(bench, plan)
     for word in ("brick", "joint_speed", "outside the workspace", "bears"):
-        assert any(word in line for line in found), word
-    assert len(set(found)) == len(found)
-    assert all("\n" not in line for line in found)
+        assert any(word in line for line in refusals), word
+    assert len(set(refusals)) == len(refusals)
+    assert all("\n" not in line for line in refusals)
 
 
 steps = st.lists(

@@ -152,8 +152,8 @@ SECOND_OUTSIDE = cell(tool={"targets": TARGETS}, limits={"workspace_min_m": [-3.
 def test_what_the_planner_refuses_is_refused_and_stops_the_arm(config, q, word):
     """The tool 0.86 m below the plane, without a workspace; a second target 0.39 m outside."""
     assert not planned(config, q)
-    found = refused_lines(config, q)
-    assert any(word in line for line in found), found
+    refusals = refused_lines(config, q)
+    assert any(word in line for line in refusals), refusals
     assert word in str(stopped(config, q))
 
 

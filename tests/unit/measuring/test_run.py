@@ -227,13 +227,13 @@ def test_repeatability_is_estimated_at_the_end():
     b.world.position = position
     plan = plan_of(*((p, "none", c) for c in range(12) for p in ("p1", "p2", "p3")))
     b.measure(plan)
-    found = b.store.last("repeatability")
-    assert found["poses"] == 3
-    assert found["dof"] == 33
-    assert found["joint_std"] == pytest.approx(5e-5, rel=0.35)
-    assert found["scatter"] > 3 * found["instrument"]
+    repeatable = b.store.last("repeatability")
+    assert repeatable["poses"] == 3
+    assert repeatable["dof"] == 33
+    assert repeatable["joint_std"] == pytest.approx(5e-5, rel=0.35)
+    assert repeatable["scatter"] > 3 * repeatable["instrument"]
     (said,) = b.remarks("33 returns to 3 poses")
-    assert f"joint_std_rad is about {found['joint_std']:.1g}" in said
+    assert f"joint_std_rad is about {repeatable['joint_std']:.1g}" in said
 
 
 def test_repeatability_law():
@@ -247,8 +247,8 @@ def test_repeatability_law():
             for _ in range(4):
                 position = rng.normal(0.0, np.sqrt((1.0 + 4.0 * gain) / 3.0), 3)
                 visits.append(UnloadedVisit(pose, position, np.eye(3) / 3.0, gain))
-        found = repeatability(visits)
-        squares.append(found.joint_std**2)
+        repeatable = repeatability(visits)
+        squares.append(repeatable.joint_std**2)
     assert np.mean(squares) == pytest.approx(4.0, rel=0.1)
     assert repeatability([UnloadedVisit("a", np.zeros(3), np.eye(3), 1.0)]) is None
 
@@ -257,9 +257,9 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
     rng, said = np.random.default_rng(1), 0
     for _ in range(200):
         at = rng.normal(0.0, 1e-5, (8, 3))
-        found = repeatability([UnloadedVisit("ab"[k % 2], x, 1e-10 * np.eye(3), 1.0)
+        repeatable = repeatability([UnloadedVisit("ab"[k % 2], x, 1e-10 * np.eye(3), 1.0)
                                for k, x in enumerate(at)])  # fmt: skip
-        said += "joint_std_rad is about" in found.sentence(np.zeros(6))
+        said += "joint_std_rad is about" in repeatable.sentence(np.zeros(6))
     assert said < 12
 
 

@@ -48,13 +48,13 @@ def confirmed(b):
 
 def carried(b):
     """What hangs at the start of each motion, and the payload that the controller knows, kg."""
-    found = []
+    collected = []
 
     def noted(*_):
-        found.append((b.world.load, b.world.payload[0]))
+        collected.append((b.world.load, b.world.payload[0]))
 
     call_before(b.rig.arm, "start_move", noted)
-    return found
+    return collected
 
 
 KNOWN = {("none", 0.8), ("3kg", 3.8), ("pull", 0.8)}

@@ -62,19 +62,19 @@ def test_without_noise_everything_is_recovered(seed, mass, com, poses):
     bias = rng.normal(size=6) * np.repeat((10.0, 1.0), 3)
     wrench = reading(R, gravity, bias, mass, np.array(com))
     try:
-        found = identify_tool_load(wrench, covariances(poses, rng), R, gravity)
+        tool_load = identify_tool_load(wrench, covariances(poses, rng), R, gravity)
     except CannotAnswerError:
         u = np.swapaxes(R, 1, 2) @ gravity / 9.80665
         assert np.linalg.svd(u - u.mean(axis=0))[1][1] < 0.1 * np.sqrt(poses)
         return
-    assert found.bias == pytest.approx(bias, abs=1e-7)
-    assert found.mass == pytest.approx(mass, abs=1e-8)
-    assert found.moment == pytest.approx(mass * np.array(com), abs=1e-8)
-    assert found.chi2 == pytest.approx(0.0, abs=1e-8)
-    assert found.dof == 6 * poses - 10
+    assert tool_load.bias == pytest.approx(bias, abs=1e-7)
+    assert tool_load.mass == pytest.approx(mass, abs=1e-8)
+    assert tool_load.moment == pytest.approx(mass * np.array(com), abs=1e-8)
+    assert tool_load.chi2 == pytest.approx(0.0, abs=1e-8)
+    assert tool_load.dof == 6 * poses - 10
     if mass > 0.5:
-        assert found.com == pytest.approx(np.array(com), abs=1e-6)
-    assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
+        assert tool_load.com == pytest.approx(np.array(com), abs=1e-6)
+    assert tool_load.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
 
 
 @pytest.mark.long
@@ -82,22 +82,24 @@ def test_estimates_scatter_as_their_covariance_says(rng):
     K, N = 8, 1500
     R, cov = rotations(K, rng), covariances(K, rng)
     truth = np.concatenate([BIAS, [MASS], MASS * COM])
-    found = [identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY) for _ in range(N)]
-    x = np.array([np.concatenate([f.bias, [f.mass], f.moment]) for f in found])
-    inverse = np.linalg.inv(found[0].covariance)
+    estimates = [
+        identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY) for _ in range(N)
+    ]
+    x = np.array([np.concatenate([f.bias, [f.mass], f.moment]) for f in estimates])
+    inverse = np.linalg.inv(estimates[0].covariance)
     error = x - truth
     # squared Mahalanobis distances are chi² of 10; their mean has the variance 20 / N
     distance = np.einsum("ki,ij,kj->k", error, inverse, error)
     assert distance.mean() == pytest.approx(10.0, abs=4 * np.sqrt(20 / N))
     # each direction by itself: whitened scatter is the unit matrix
-    L = np.linalg.cholesky(found[0].covariance)
+    L = np.linalg.cholesky(estimates[0].covariance)
     white = np.linalg.solve(L, error.T)
     assert white @ white.T / N == pytest.approx(np.eye(10), abs=5 * np.sqrt(2 / N))
-    chi2 = np.array([f.chi2 for f in found])
+    chi2 = np.array([f.chi2 for f in estimates])
     assert chi2.mean() == pytest.approx(6 * K - 10, abs=4 * np.sqrt(2 * (6 * K - 10) / N))
     assert np.mean(chi2 > chi2_law.ppf(0.95, 6 * K - 10)) == pytest.approx(0.05, abs=0.023)
-    com = np.array([f.com for f in found])
-    assert com.std(axis=0) == pytest.approx(found[0].com_std, rel=0.1)
+    com = np.array([f.com for f in estimates])
+    assert com.std(axis=0) == pytest.approx(estimates[0].com_std, rel=0.1)
 
 
 def test_a_wrong_model_shows_in_the_variance_factor(rng):
@@ -138,9 +140,9 @@ def test_a_sensor_mounted_the_other_way_round_and_values_that_are_no_numbers_are
 
 def test_a_massless_tool_has_its_centre_of_mass_nowhere(rng):
     R, cov = rotations(8, rng), covariances(8, rng)
-    found = identify_tool_load(reading(R, mass=0.0) + noise(cov, rng), cov, R, GRAVITY)
-    assert np.all(np.isfinite(found.com))
-    assert abs(found.mass) < 5 * np.sqrt(found.covariance[6, 6])
+    tool_load = identify_tool_load(reading(R, mass=0.0) + noise(cov, rng), cov, R, GRAVITY)
+    assert np.all(np.isfinite(tool_load.com))
+    assert abs(tool_load.mass) < 5 * np.sqrt(tool_load.covariance[6, 6])
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -149,14 +151,14 @@ def test_tare_with_the_tool_known_gives_zero_and_load(seed):
     R = rotations(4, rng)
     load = rng.normal(size=(4, 6)) * 50.0
     unloaded, cov = reading(R[:1])[0], covariances(1, rng)[0]
-    found = tare(unloaded, cov, R[0], GRAVITY, MASS, COM)
-    assert found.bias == pytest.approx(BIAS, abs=1e-9)
-    assert found.com == pytest.approx(COM)
-    assert found.covariance[:6, :6] == pytest.approx(cov)
-    assert not np.any(found.covariance[6:])
-    felt = found.load_wrench(reading(R, load=load), R)
+    tared = tare(unloaded, cov, R[0], GRAVITY, MASS, COM)
+    assert tared.bias == pytest.approx(BIAS, abs=1e-9)
+    assert tared.com == pytest.approx(COM)
+    assert tared.covariance[:6, :6] == pytest.approx(cov)
+    assert not np.any(tared.covariance[6:])
+    felt = tared.load_wrench(reading(R, load=load), R)
     assert felt == pytest.approx(load, abs=1e-9)
-    assert found.load_wrench(reading(R, load=load)[1], R[1]) == pytest.approx(load[1], abs=1e-9)
+    assert tared.load_wrench(reading(R, load=load)[1], R[1]) == pytest.approx(load[1], abs=1e-9)
 
 
 def test_the_load_s_wrench_scatters_as_its_covariance_says(rng):
@@ -166,10 +168,10 @@ def test_the_load_s_wrench_scatters_as_its_covariance_says(rng):
     load = np.array([[10.0, 0.0, -98.0, 1.0, 2.0, 0.0]])
     error = []
     for _ in range(N):
-        found = identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY)
+        tool_load = identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY)
         sample = reading(pose, load=load) + noise(one, rng)
-        error.append(found.load_wrench(sample[0], pose[0]) - load[0])
-    stated = found.load_covariance(one[0], pose[0])
+        error.append(tool_load.load_wrench(sample[0], pose[0]) - load[0])
+    stated = tool_load.load_covariance(one[0], pose[0])
     white = np.linalg.solve(np.linalg.cholesky(stated), np.array(error).T)
     assert white @ white.T / N == pytest.approx(np.eye(6), abs=5 * np.sqrt(2 / N))
 
@@ -227,5 +229,5 @@ UNSURE = "asked for 10 kg (98.1 N), measured 98.1 N ± 6.0 N: too uncertain"
     ],
 )  # fmt: skip
 def test_what_hangs_is_told_in_words(expected, measured, std, right, text):
-    found, said = compare(expected, measured, np.full(6, std), 3.0, 0.0, GRAVITY)
-    assert (found, said[: len(text)]) == (right, text)
+    comparison, said = compare(expected, measured, np.full(6, std), 3.0, 0.0, GRAVITY)
+    assert (comparison, said[: len(text)]) == (right, text)

@@ -79,13 +79,13 @@ def test_a_plan_for_predictions_says_what_a_real_arm_is_mispredicted_by(shown):
     of_all = {"all_effects_std_m": 2.5e-4, "random_std_m": 3.2e-4, "efficiency": 0.16}
     summary = replace(SUMMARY, criterion="I", curve=curve, **of_all)
     words = " ".join(shown(summary).split())
-    for told in (
+    for expected in (
         "deflection ± 250 µm, predicted for",
         "as many random poses: ± 320 µm; if the model were complete: ± 12.0 µm",
         "splits a reading over many poses, which no plan can",
         "More than 6 poses still improve the prediction.",
     ):
-        assert told in words
+        assert expected in words
     assert summary.to_dict()["all_effects_std_m"] == 2.5e-4
 
 

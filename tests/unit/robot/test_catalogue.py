@@ -74,7 +74,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
     arm, joints = load_arm(name), OTHERS[name]["joints"]
     tool = in_degrees(*OTHERS[name]["flange"])
     q = np.random.default_rng(3).uniform(-2.0, 2.0, (20, len(joints)))
-    found = evaluate(arm, q)
+    chain = evaluate(arm, q)
     angles = q.copy()
     if name == "m10ia":  # its controller counts joint 3 from the horizontal, the URDF does not
         angles[:, 2] += angles[:, 1]
@@ -84,7 +84,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
             about = (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]
             turn = pin.SE3(pin.AngleAxis(angle, about).matrix(), np.zeros(3)).homogeneous
             pose = pose @ in_degrees(*origin) @ turn
-        flange_at(found, i, pose @ tool, 1e-9)
+        flange_at(chain, i, pose @ tool, 1e-9)
     assert arm.source
     assert np.isfinite(arm.payload)
     assert np.all((arm.q_max - arm.q_min > 1.0) & (arm.q_max - arm.q_min < 15.0))
@@ -93,7 +93,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         weight = np.array([0.0, 0.0, -9.81])
         load = Load(np.zeros((20, 6)), np.zeros(3), 0.0, np.zeros(3), weight)
         assert np.all(
-            np.abs(arm.joint_components(slot_wrenches(arm, found, load))) < arm.torque_max
+            np.abs(arm.joint_components(slot_wrenches(arm, chain, load))) < arm.torque_max
         )
 
 

@@ -125,11 +125,11 @@ def test_bodies_and_flange_are_where_pinocchio_has_them(name):
     assert poses.shape == (4, arm.n + 2, 4, 4)
     model = pinocchio_model(arm)
     data = model.createData()
-    for angles, found in zip(q, poses, strict=True):
+    for angles, pose in zip(q, poses, strict=True):
         pin.framesForwardKinematics(model, data, angles)
         placed = [np.eye(4), *(data.oMi[k].homogeneous for k in range(1, arm.n + 1))]
         placed.append(data.oMf[model.getFrameId(FLANGE)].homogeneous)
-        np.testing.assert_allclose(found, placed, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(pose, placed, rtol=0, atol=1e-12)
 
 
 MAGNITUDES = (0.0, 1e-9, 1e-6, 1e-3, 0.1, 0.499, 0.501, 1.0, 3.0, 3.14)
@@ -161,9 +161,9 @@ def test_vectors_of_rotations_by_about_half_a_turn(short):
     w = np.vstack([w, np.eye(3), -np.eye(3), np.eye(3)[:2] + np.eye(3)[1:]])
     w *= (np.pi - short) / np.linalg.norm(w, axis=1, keepdims=True)
     r = se3.rotation(w)
-    found = se3.rotation_vector(r)
-    assert np.linalg.norm(found, axis=1).max() <= np.pi + 1e-15
-    np.testing.assert_allclose(se3.rotation(found), r, rtol=0, atol=1e-14)
+    result = se3.rotation_vector(r)
+    assert np.linalg.norm(result, axis=1).max() <= np.pi + 1e-15
+    np.testing.assert_allclose(se3.rotation(result), r, rtol=0, atol=1e-14)
 
 
 def test_one_twist_and_none_at_all():
@@ -203,7 +203,7 @@ def test_torques_are_those_that_pinocchio_holds_against(name, gravity):
     # Pinocchio's generalized gravity holds the arm; weight and load pull the other way.
     arm = arm_of(name)
     q, d, load = case(arm, GRAVITIES[gravity])
-    found = slot_wrenches(arm, evaluate(arm, q, d), load)
+    wrenches = slot_wrenches(arm, evaluate(arm, q, d), load)
     for i in range(STATES):
         model = pinocchio_model(twisted(arm, d.twist[i]))
         model.gravity.linear = load.gravity
@@ -217,14 +217,14 @@ def test_torques_are_those_that_pinocchio_holds_against(name, gravity):
         jacobian = pin.computeFrameJacobian(model, data, angle, point, axes)
         held = pin.computeGeneralizedGravity(model, data, angle)
         torque = jacobian.T @ load.wrench[i] - held
-        np.testing.assert_allclose(arm.joint_components(found)[i], torque, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(arm.joint_components(wrenches)[i], torque, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["ur10e", ODD])
 def test_wrenches_are_sums_over_all_that_hangs_beyond(name):
     arm = arm_of(name)
     q, d, load = case(arm, GRAVITIES["odd"])
-    found = slot_wrenches(arm, evaluate(arm, q, d), load)
+    wrenches = slot_wrenches(arm, evaluate(arm, q, d), load)
     for i in range(STATES):
         links = arm.links @ np.array([displacement(t) for t in d.twist[i]])
         pose, slots, coms = links[0], [links[0]], []
@@ -242,8 +242,8 @@ def test_wrenches_are_sums_over_all_that_hangs_beyond(name):
                 force = force + mass * load.gravity
                 moment = moment + np.cross(com - slot[:3, 3], mass * load.gravity)
             turn = slot[:3, :3].T
-            np.testing.assert_allclose(found[i, k, :3], turn @ force, rtol=0, atol=1e-10)
-            np.testing.assert_allclose(found[i, k, 3:], turn @ moment, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(wrenches[i, k, :3], turn @ force, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(wrenches[i, k, 3:], turn @ moment, rtol=0, atol=1e-10)
 
 
 def test_change_of_the_wrenches_is_their_difference():
@@ -254,12 +254,12 @@ def test_change_of_the_wrenches_is_their_difference():
     chain = evaluate(arm, q, d)
     rng = np.random.default_rng(6)
     change = rng.normal(size=(STATES, 4, 6)) * 50
-    found = slot_wrench_change(chain, change[:, :, :3], change[:, :, 3:])
-    assert found.shape == (STATES, 4, arm.n + 1, 6)
+    wrenches = slot_wrench_change(chain, change[:, :, :3], change[:, :, 3:])
+    assert wrenches.shape == (STATES, 4, arm.n + 1, 6)
     for p in range(4):
         more = replace(load, wrench=load.wrench + change[:, p])
         expected = slot_wrenches(arm, chain, more) - slot_wrenches(arm, chain, load)
-        np.testing.assert_allclose(found[:, p], expected, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(wrenches[:, p], expected, rtol=0, atol=1e-10)
 
 
 def test_load_point_may_differ_from_state_to_state():
@@ -267,10 +267,10 @@ def test_load_point_may_differ_from_state_to_state():
     q, d, load = case(arm, GRAVITIES["floor"])
     chain = evaluate(arm, q, d)
     points = np.random.default_rng(7).normal(size=(STATES, 3))
-    found = slot_wrenches(arm, chain, replace(load, point=points))
+    wrenches = slot_wrenches(arm, chain, replace(load, point=points))
     for i in range(STATES):
         alone = slot_wrenches(arm, chain, replace(load, point=points[i]))
-        np.testing.assert_allclose(found[i], alone[i], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(wrenches[i], alone[i], rtol=0, atol=1e-12)
 
 
 STEP = 1e-5
@@ -305,9 +305,9 @@ def test_gradient_by_joints_and_twists(arm):
     for k in range(n + 1):
         v = gradient.displacement(k)
         moved = twist_jacobian(chain.rotation[k], np.zeros((count, 3)), chain.twist[k])
-        found = np.concatenate([v, gradient.turn(k)], axis=2) @ moved
+        derivative = np.concatenate([v, gradient.turn(k)], axis=2) @ moved
         for e in range(6):
             unit = np.zeros((n + 1, 6))
             unit[k, e] = 1.0
             expected = slope(0.0, unit)
-            np.testing.assert_allclose(found[:, :, e], expected, rtol=1e-7, atol=1e-6)
+            np.testing.assert_allclose(derivative[:, :, e], expected, rtol=1e-7, atol=1e-6)

@@ -53,10 +53,10 @@ def test_flange_and_masses_are_those_of_the_drawn_arm_at_the_turned_angles():
 def test_jacobian_by_the_controllers_values_agrees_with_differences():
     arm, q, step = described(**KEYS), np.random.default_rng(1).uniform(-2, 2, (3, 6)), 1e-6
     chain = evaluate(arm, q)
-    found = drive_jacobian(arm, chain, chain.position[-1])[:, :3]
+    derivative = drive_jacobian(arm, chain, chain.position[-1])[:, :3]
     for j in range(6):
         ahead, back = (evaluate(arm, q + s * np.eye(6)[j]).position[-1] for s in (step, -step))
-        np.testing.assert_allclose(found[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
+        np.testing.assert_allclose(derivative[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
 
 
 @refusals("conventions")
@@ -247,8 +247,8 @@ def test_a_table_may_leave_its_column_out(tmp_path):
     arm = arm_from_urdf(urdf_of_mimic(tmp_path))
     for columns in ((1, 2, 5), (1, 2, 3, 4, 5)):
         path, q = table(tmp_path, arm, columns)
-        found = read_table(path, arm, NOISE)
-        np.testing.assert_allclose(found.states.q, q, atol=1e-6)
+        readings = read_table(path, arm, NOISE)
+        np.testing.assert_allclose(readings.states.q, q, atol=1e-6)
     path, _ = table(tmp_path, arm, (1, 2, 3, 4, 5), change=0.01)
     refusal(r"q3_rad.*by the arm's description j3 follows to", read_table, path, arm, NOISE)
     path, _ = table(tmp_path, arm, (1, 3, 4, 5))

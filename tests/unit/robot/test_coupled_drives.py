@@ -135,9 +135,9 @@ def test_laws_of_coupled_drives_are_the_worlds(law, mechanical):
     size = np.abs(predicted.observation.position - rigid).max()
     assert moved <= order * size + 1e-11
     scale = np.array([p.scale for e in effects for p in e.parameters])
-    found = model.jacobian(predicted, theta, 6)
+    derivative = model.jacobian(predicted, theta, 6)
     quotient = numeric_jacobian(model, states, theta, 1e-2 * scale, 6) / (1e-2 * scale)
-    off = np.abs(found - quotient).max(axis=(0, 1)) * scale
+    off = np.abs(derivative - quotient).max(axis=(0, 1)) * scale
     assert off.max() <= 1e-6 * (np.abs(quotient).max(axis=(0, 1)) * scale).max() + 1e-12
 
 

@@ -55,10 +55,10 @@ def test_a_calibration_conf_adds_to_the_nominal_rows(tmp_path):
     deltas = factory.rows - nominal_rows(nominal)
     file = tmp_path / "calibration.conf"
     file.write_text(CONF.format(*(str(list(map(float, row))) for row in deltas)))
-    found = read_factory(file, nominal)
-    np.testing.assert_allclose(found.rows, factory.rows, rtol=1e-15, atol=1e-15)
-    assert found.status == 2
-    assert found.checksum[0] == 0xB630883C
+    result = read_factory(file, nominal)
+    np.testing.assert_allclose(result.rows, factory.rows, rtol=1e-15, atol=1e-15)
+    assert result.status == 2
+    assert result.checksum[0] == 0xB630883C
 
 
 def test_the_file_of_ur_calibration_is_the_published_arm(tmp_path):
@@ -66,27 +66,27 @@ def test_the_file_of_ur_calibration_is_the_published_arm(tmp_path):
     file = tmp_path / "my_robot_calibration.yaml"
     file.write_text(UR5E_YAML)
     nominal = load_arm("ur5e")
-    found = read_factory(file, nominal)
-    arm = with_factory(nominal, found)
+    factory = read_factory(file, nominal)
+    arm = with_factory(nominal, factory)
     rms, most = flange_difference(arm, nominal)
     assert 5e-4 < rms < most < 3e-3  # some millimetres, as factories find
     q = states()
-    pose = np.broadcast_to(found.links[0], (len(q), 4, 4))
+    pose = np.broadcast_to(factory.links[0], (len(q), 4, 4))
     for k in range(6):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
         turn[:, 0, 0] = turn[:, 1, 1] = np.cos(q[:, k])
         turn[:, 1, 0], turn[:, 0, 1] = np.sin(q[:, k]), -np.sin(q[:, k])
-        pose = pose @ turn @ found.links[k + 1]
+        pose = pose @ turn @ factory.links[k + 1]
     np.testing.assert_allclose(evaluate(arm, q).position[-1], pose[:, :3, 3], rtol=0, atol=1e-12)
 
 
 def test_a_file_of_our_own_comes_back(tmp_path):
     made, file = factory_of("ur15"), tmp_path / "arm.toml"
     file.write_text(made.to_toml())
-    found = read_factory(file, load_arm("ur15"))
-    np.testing.assert_array_equal(found.rows, made.rows)
-    assert found.checksum == made.checksum
-    np.testing.assert_array_equal(of_dict(found.to_dict(), "kept").rows, made.rows)
+    factory = read_factory(file, load_arm("ur15"))
+    np.testing.assert_array_equal(factory.rows, made.rows)
+    assert factory.checksum == made.checksum
+    np.testing.assert_array_equal(of_dict(factory.to_dict(), "kept").rows, made.rows)
 
 
 @refusals("factory")

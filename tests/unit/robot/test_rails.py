@@ -99,10 +99,10 @@ def test_a_gantry_is_that_of_its_urdf(tmp_path):
     model = pin.buildModelFromXML(GANTRY)
     data = model.createData()
     q = np.random.default_rng(2).uniform(-1.0, 1.0, (10, 5))
-    found = evaluate(arm, q)
+    chain = evaluate(arm, q)
     for i in range(10):
         pin.framesForwardKinematics(model, data, q[i])
-        flange_at(found, i, data.oMf[model.getFrameId("tool0")].homogeneous)
+        flange_at(chain, i, data.oMf[model.getFrameId("tool0")].homogeneous)
 
 
 def test_a_column_of_two_stages_moves_by_both(tmp_path):
@@ -308,9 +308,9 @@ joint_std_rad = 1e-5
     run = tmp_path / "run.hilcal"
     ok(capsys, "import", tmp_path / "theirs.csv", "--config", tmp_path / "cell.toml",
        "--format", tmp_path / "map.toml", "-o", run)  # fmt: skip
-    found = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
-    assert found["verdict"] == "adequate"
-    assert "guide_error" in found["revisions"][-1]["model"]
+    document = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
+    assert document["verdict"] == "adequate"
+    assert "guide_error" in document["revisions"][-1]["model"]
     points = tmp_path / "points.csv"
     points.write_text(
         "pose,q1_mm,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,q7_deg\na,1500,0,-60,80,-90,-70,5\n"

@@ -29,8 +29,8 @@ def test_distance_of_segments(a, b, c, d):
     second = ends[2] + share * (ends[3] - ends[2])
     nearest = np.linalg.norm(first[:, None] - second[None], axis=2).min()
     coarse = (np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[3] - ends[2])) / 160
-    found = float(segment_distance(*ends))
-    assert nearest - coarse - 1e-9 <= found <= nearest + 1e-9
+    distance = float(segment_distance(*ends))
+    assert nearest - coarse - 1e-9 <= distance <= nearest + 1e-9
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])

@@ -127,10 +127,10 @@ def test_memory_that_runs_out_is_one_line_and_the_limit_is_as_before(monkeypatch
 
     @limits.bounded
     def read(path):
-        found = []
-        while len(found) < 10_000_000:
-            found.append([len(found)])
-        return found
+        collected = []
+        while len(collected) < 10_000_000:
+            collected.append([len(collected)])
+        return collected
 
     gc.collect()
     gc.disable()  # a finalizer of another test that runs out of memory, too, is told as an error

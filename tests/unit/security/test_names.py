@@ -153,8 +153,8 @@ def test_csv(name):
     the_same_cells(plan_csv(plan), [[None] * 10, [None, name, name, *[None] * 7]])
     assert plan_csv(plan).endswith(",-0.5\n")
     errors = SimpleNamespace(error_m=np.ones(1), std_m=np.ones(1), band_m=np.ones(1))
-    found = SimpleNamespace(q=np.zeros((1, 6)), before=errors, after=errors)
-    the_same_cells(_csv((name,), found, ("rad",) * 6), [[None] * 10, [name, *[None] * 9]])
+    result = SimpleNamespace(q=np.zeros((1, 6)), before=errors, after=errors)
+    the_same_cells(_csv((name,), result, ("rad",) * 6), [[None] * 10, [name, *[None] * 9]])
     arm = replace(ARM, joint_names=(name,) * 6)
     rows = to_csv(dh_rows(ARM, "standard"), arm)
     the_same_cells(rows, [[None] * 5, *[[name, *[None] * 4]] * 6])
@@ -172,10 +172,10 @@ def test_xml_and_yaml(name):
     arm = replace(ARM, name=name, joint_names=tuple(f"{name}{k}" for k in "abcdef"))
     text = urdf(arm, f"{name}\n{name}-")
     assert harmless(text)
-    found, plain_ = ElementTree.fromstring(text), ElementTree.fromstring(urdf(ARM))
-    assert [x.tag for x in found.iter()] == [x.tag for x in plain_.iter()]
-    assert found.get("name") == escaped(name)
-    assert found.findall("joint")[0].get("name") == escaped(f"{name}a")
+    root, plain_ = ElementTree.fromstring(text), ElementTree.fromstring(urdf(ARM))
+    assert [x.tag for x in root.iter()] == [x.tag for x in plain_.iter()]
+    assert root.get("name") == escaped(name)
+    assert root.findall("joint")[0].get("name") == escaped(f"{name}a")
     made, _ = ur_kinematics(ARM, ARM, f"{name}\n{name}")
     assert harmless(made)
     assert yaml.safe_load(made) == yaml.safe_load(ur_kinematics(ARM, ARM)[0])
@@ -256,17 +256,17 @@ def report(name):
 @settings(max_examples=12, deadline=None)
 @given(names.map(lambda name: name.replace("\n", "")))  # an end of line begins a paragraph
 def test_html(name):
-    found, other = Tags(), Tags()
+    tags, other = Tags(), Tags()
     text = report(f"x{name}")  # a cell without a short class has the same tag
     assert harmless(text)
-    found.feed(text)
+    tags.feed(text)
     other.feed(report("x" * 24))
-    short = [(tag, [a for a in keys if a != "class"]) for tag, keys in found.tags]
+    short = [(tag, [a for a in keys if a != "class"]) for tag, keys in tags.tags]
     assert short == [(tag, [a for a in keys if a != "class"]) for tag, keys in other.tags]
     words = escaped("x" + name)
-    assert words in found.words
-    assert words in found.labels
-    scripts = [w for w in found.words if w.startswith("{")]
+    assert words in tags.words
+    assert words in tags.labels
+    scripts = [w for w in tags.words if w.startswith("{")]
     drawn = json.loads(scripts[0])["data"][0]["x"][0]
     assert "<" not in drawn
     assert drawn == in_chart(f"x{name}")
@@ -291,9 +291,9 @@ def test_python(name):
     source = source_of_form(form, "my_law", evidence=f"{name}\n{name}", file=name)
     other = source_of_form(form, "my_law", evidence="a\nb", file="F.py")
     assert harmless(source)
-    found, wanted = ast.parse(source), ast.parse(other)
-    assert ast.dump(ast.Module(found.body[1:], [])) == ast.dump(ast.Module(wanted.body[1:], []))
-    assert escaped(name).strip() in (ast.get_docstring(found, clean=False) or "")
+    tree, wanted = ast.parse(source), ast.parse(other)
+    assert ast.dump(ast.Module(tree.body[1:], [])) == ast.dump(ast.Module(wanted.body[1:], []))
+    assert escaped(name).strip() in (ast.get_docstring(tree, clean=False) or "")
 
 
 @pytest.mark.parametrize("name", ["a\nimport os", "a-b", "A", ""])

@@ -72,9 +72,9 @@ def test_a_campaign_in_such_a_cell_reveals_it(law):
     model = baseline(r.cell, r.readings, r.mode, catalogue)
     d = diagnose(fit(model, r.readings, r.mode))
     assert "mine" in (d.suspects[0].effect, *d.suspects[0].same_as)
-    found = add(d.fit, "mine")
-    true, std = secret.world.truth["mine.a"], found.uncertainty.std[-1]
-    assert abs(found.theta[-1] - true) < 4 * std < abs(true)
+    extended = add(d.fit, "mine")
+    true, std = secret.world.truth["mine.a"], extended.uncertainty.std[-1]
+    assert abs(extended.theta[-1] - true) < 4 * std < abs(true)
 
 
 def test_a_world_with_it_comes_back_from_its_file(law, tmp_path):

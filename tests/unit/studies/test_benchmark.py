@@ -66,7 +66,7 @@ def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path):
     middle = np.broadcast_to(truth.position.mean(axis=0), truth.position.shape)
     half, none, each = (dict.fromkeys(task.candidates, p) for p in (0.5, 0.0, 1.0))
     wide, narrow = (np.full(off.shape, std).tolist() for std in (3e-5, 3e-6))
-    found = scored(
+    scoring = scored(
         tmp_path,
         folder,
         perfect=answer(folder),
@@ -75,7 +75,7 @@ def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path):
         over=answer(folder, prediction_m=near, std_m=narrow, effects=each),
     )
     names = ("perfect", "constant", "honest", "over")
-    perfect, constant, honest, over = (found[name][0] for name in names)
+    perfect, constant, honest, over = (scoring[name][0] for name in names)
     assert (perfect["rms_m"], perfect["coverage"], perfect["log_score"]) == (0.0, 1.0, 0.0)
     assert (perfect["false_alarms"], perfect["found"]) == (0.0, 1.0)
     assert constant["log_score"] == pytest.approx(np.log(0.5))
@@ -92,8 +92,8 @@ def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path):
     assert honest["log_score"] == pytest.approx(len(there) * np.log(0.01) / n)
     assert (over["false_alarms"], honest["false_alarms"], honest["found"]) == (1.0, 0.0, 0.0)
     # relative to the best of each task, the perfect one's nanometre
-    assert found["perfect"][1]["relative"]["value"] == pytest.approx(1.0)
-    assert found["honest"][1]["relative"]["value"] == pytest.approx(honest["rms_m"] / 1e-9)
+    assert scoring["perfect"][1]["relative"]["value"] == pytest.approx(1.0)
+    assert scoring["honest"][1]["relative"]["value"] == pytest.approx(honest["rms_m"] / 1e-9)
 
 
 def test_what_a_hidden_effect_contains_is_not_scored(tmp_path):
@@ -108,14 +108,14 @@ def test_groups_are_geometric_means_and_failures_are_counted(tmp_path):
     for folder, factor in ((one, 1.0), (two, 4.0)):
         true = read_truth(folder).position
         a, b = (true + factor * np.array([x, 0.0, 0.0]) for x in (1e-5, 2e-5))
-        found = scored(
+        scoring = scored(
             tmp_path,
             folder,
             a=answer(folder, prediction_m=a.tolist()),
             b=answer(folder, prediction_m=b.tolist()),
             c={"failed": "no time\nleft"} if folder == one else answer(folder),
         )
-    a, b, c = (found[name][1] for name in "abc")
+    a, b, c = (scoring[name][1] for name in "abc")
     assert a["error_m"]["value"] == pytest.approx(2e-5)
     assert (a["error_m"]["low"], a["error_m"]["high"]) == pytest.approx((1e-5, 4e-5))
     assert b["relative"]["value"] / a["relative"]["value"] == pytest.approx(2.0)
@@ -230,18 +230,18 @@ def test_a_formula_is_arithmetic_alone():
 
 def test_a_law_that_cannot_be_read_is_a_failure_with_its_reason(tmp_path):
     folder = folder_of("law", "law")
-    found = scored(
+    scoring = scored(
         tmp_path,
         folder,
         right=answer(folder),
         wrong=answer(folder, law={"formula": "open('x')"}),
         silent=answer(folder, law=None),
     )
-    assert found["right"][0]["law_error"] == 0.0
-    assert found["right"][0]["law_equivalent"] == 1.0
-    assert "open('x')" in found["wrong"][0]["failed"]
-    assert found["silent"][0]["law_error"] is None
-    assert found["silent"][0]["law_equivalent"] is None
+    assert scoring["right"][0]["law_error"] == 0.0
+    assert scoring["right"][0]["law_equivalent"] == 1.0
+    assert "open('x')" in scoring["wrong"][0]["failed"]
+    assert scoring["silent"][0]["law_error"] is None
+    assert scoring["silent"][0]["law_equivalent"] is None
 
 
 def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(tmp_path):
@@ -249,9 +249,9 @@ def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(tmp
     scored(tmp_path, first, some=answer(first), none=answer(first, law=None))
     scored(tmp_path, second, some=answer(second, law=None), none=answer(second, law=None))
     document = score_all(tmp_path / "tasks", tmp_path / "results")
-    found = {(r["entrant"], r["task"]): r["law_equivalent"] for r in document["tasks"]}
-    assert [found["some", f.name] for f in (first, second)] == [1.0, 0.0]
-    assert [found["none", f.name] for f in (first, second)] == [None, None]
+    equivalents = {(r["entrant"], r["task"]): r["law_equivalent"] for r in document["tasks"]}
+    assert [equivalents["some", f.name] for f in (first, second)] == [1.0, 0.0]
+    assert [equivalents["none", f.name] for f in (first, second)] == [None, None]
     entrant = next(e for e in document["groups"][0]["entrants"] if e["entrant"] == "some")
     assert entrant["law_equivalent"]["value"] == 0.5
 

@@ -112,8 +112,8 @@ def fakes(tmp_path):
 def test_the_runner_survives_whatever_entrants_do(tmp_path, fakes):
     words = ("--tasks", first_task("elastic").name, "--limit", "3", "--jobs", "2")
     assert run(tmp_path, str(TASKS), *words, home=fakes) == 0
-    found = scores(TASKS, tmp_path / "out")
-    why = {r["entrant"]: r["failed"] for r in found}
+    scoring = scores(TASKS, tmp_path / "out")
+    why = {r["entrant"]: r["failed"] for r in scoring}
     assert why.pop("good") is None
     assert why.pop("crash") == "exit code 1: ValueError: no such arm"
     assert why.pop("hang") == "no answer within 3 s"
@@ -121,9 +121,9 @@ def test_the_runner_survives_whatever_entrants_do(tmp_path, fakes):
     assert "prediction_m has shape (199, 3)" in why.pop("short")
     assert why.pop("cannot") == "not run: needs Julia"
     assert why.pop("silent") == "cannot be read (No such file or directory)"
-    text = page("2026-01-01", found, fakes)
+    text = page("2026-01-01", scoring, fakes)
     assert "| `crash` | exit code 1: ValueError: no such arm | 1 |" in text
-    assert "| good | 1.00 |" in block(found)
+    assert "| good | 1.00 |" in block(scoring)
 
 
 def test_what_was_run_is_not_run_again(tmp_path, fakes):

@@ -160,13 +160,13 @@ def test_the_worst_split_decides():
 def test_an_arm_is_measured_twice_and_predicted():
     """Errors of poses not fitted are near the noise; even seeds lack nothing."""
     config = configuration()
-    found = band_cases(0, config=config, robot="ur10e", numbers=[20], first=60)
-    assert [c.lacking for c in found] == [""]
-    assert 1e-5 < found[0].mean_m < 2e-4
-    assert found[0].inside > 0.8
-    (figure,) = _figures_of_bands(found, [20])
+    cases = band_cases(0, config=config, robot="ur10e", numbers=[20], first=60)
+    assert [c.lacking for c in cases] == [""]
+    assert 1e-5 < cases[0].mean_m < 2e-4
+    assert cases[0].inside > 0.8
+    (figure,) = _figures_of_bands(cases, [20])
     assert "over 1 arms" in figure.measured
-    assert figure.met == (0.90 <= found[0].inside <= 0.97)
+    assert figure.met == (0.90 <= cases[0].inside <= 0.97)
 
 
 @pytest.mark.long
@@ -175,11 +175,11 @@ def test_few_positions_predict_nearly_as_well_as_can_be():
 
     Without a background their errors are 1.1 and 1.5 times as large.
     """
-    found = [refined(AllEffectsCase(30, seed, 1.0, True)) for seed in (0, 2)]
-    ratios = [f.rms_m / f.best_m for f in found if f is not None]
+    refinements = [refined(AllEffectsCase(30, seed, 1.0, True)) for seed in (0, 2)]
+    ratios = [f.rms_m / f.best_m for f in refinements if f is not None]
     assert len(ratios) == 2
     assert np.mean(ratios) < 1.2
-    for f in found:
+    for f in refinements:
         assert f.inside > 0.85
         assert f.rms_m < f.without_m
         assert "link_geometry" in f.named
@@ -208,20 +208,20 @@ def test_claims_count_what_they_say():
     wrong = DiscoveryOutcome(GOOD, "law", "dq_3 = a", "wear", False, True, 0.9, 2.0, 1.6)
     silent = DiscoveryOutcome(DiscoveryCase("ur5e", "absolute"), "adequate")
     alarm = DiscoveryOutcome(DiscoveryCase("ur5e", "absolute", stated=0.5), "law", "dq_1 = a")
-    found = {f.what: f for f in claims([right, wrong, silent, alarm])}
-    assert found["site right"].measured == "50 % (1 of 2)"
-    assert found["error at fresh poses at most 1.15 times the noise"].met is False
-    assert found["excess of the error at fresh poses halved"].measured == "50 % (1 of 2)"
-    assert found["variables right"].met is True
-    assert found["no law where nothing is hidden"].met is True
-    assert found["no law where the noise is misjudged by two"].met is False
-    assert "no law where an effect of the catalogue is hidden" not in found  # none was
+    by_claim = {f.what: f for f in claims([right, wrong, silent, alarm])}
+    assert by_claim["site right"].measured == "50 % (1 of 2)"
+    assert by_claim["error at fresh poses at most 1.15 times the noise"].met is False
+    assert by_claim["excess of the error at fresh poses halved"].measured == "50 % (1 of 2)"
+    assert by_claim["variables right"].met is True
+    assert by_claim["no law where nothing is hidden"].met is True
+    assert by_claim["no law where the noise is misjudged by two"].met is False
+    assert "no law where an effect of the catalogue is hidden" not in by_claim  # none was
     plain = replace(GOOD, strength=10.0, poses=100)
     nine = [DiscoveryOutcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
     wrong = DiscoveryOutcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)
-    found = {f.what: f for f in claims([*nine, wrong])}
-    assert found["site right"].met is False  # nine of ten are enough elsewhere
-    assert found["variables right"].required == "95 %"
+    by_claim = {f.what: f for f in claims([*nine, wrong])}
+    assert by_claim["site right"].met is False  # nine of ten are enough elsewhere
+    assert by_claim["variables right"].required == "95 %"
 
 
 def test_a_case_that_is_in_the_file_is_not_run_again(tmp_path):

@@ -41,8 +41,8 @@ async def opened(session: WorkbenchSession) -> AsyncIterator[User]:
 
 def seen(user, kind, mark):
     """Texts of elements that show, with a property."""
-    found = [e for e in user.client.elements.values() if isinstance(e, kind) and e.visible]
-    return [str(e.props.get("innerHTML") or getattr(e, "text", "")) for e in found
+    selected = [e for e in user.client.elements.values() if isinstance(e, kind) and e.visible]
+    return [str(e.props.get("innerHTML") or getattr(e, "text", "")) for e in selected
             if mark in str(dict(e.props)) or mark in e.classes]  # fmt: skip
 
 
@@ -65,8 +65,8 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(session, reas
             await user.should_see("No effect passes the tests by itself")
             said = " ".join(seen(user, ui.html, "innerHTML") + seen(user, ui.label, "")).lower()
             first = {v: words.split(":")[0] for v, words in HEADLINES.items()}
-            found = [v for v, w in first.items() if f"! {w}" in said or f"✓ {w}" in said]
-            assert found == [judged.verdict]
+            value = [v for v, w in first.items() if f"! {w}" in said or f"✓ {w}" in said]
+            assert value == [judged.verdict]
             assert "is needed" not in said
             assert "nothing is missing" not in said
             law = [f"hilcal discover {shown.path} -o law.py"]

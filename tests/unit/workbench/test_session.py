@@ -103,12 +103,12 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run, session, snapshot):
     refusal("no value differs from what is used already", session.change_cell, snapshot, same)
     added = session.add(snapshot, BASE)
     refusal("has changed since that click", session.change_cell, snapshot, mass)
-    found = session.change_cell(added, mass)
-    assert (found.number, found.changes) == (3, {"tool": {"mass_kg": 1.4}})
-    assert found.diagnosis.history == added.diagnosis.history
-    assert found.diagnosis.verdict == added.diagnosis.verdict
+    extended = session.change_cell(added, mass)
+    assert (extended.number, extended.changes) == (3, {"tool": {"mass_kg": 1.4}})
+    assert extended.diagnosis.history == added.diagnosis.history
+    assert extended.diagnosis.verdict == added.diagnosis.verdict
     again = WorkbenchSession(run, few_effects()).load()
-    assert (again.number, again.diagnosis.verdict) == (3, found.diagnosis.verdict)
+    assert (again.number, again.diagnosis.verdict) == (3, extended.diagnosis.verdict)
     assert [c.number for c in again.chapters] == [3]
     assert next(f.text for f in again.cell_keys if f.key == "mass_kg") == "1.4"
     before = WorkbenchSession(run, few_effects()).load(revision=2)
@@ -131,11 +131,11 @@ def test_readings_that_came_later_are_fitted_anew(run, session, snapshot):
         o.append(snapshot.fit)
         o.file.append_readings(o.file.readings()[:6])
     refusal("was fitted before readings were appended", session.load)
-    found = session.refit(snapshot)  # on a snapshot older than the file
-    assert session.snapshot is found
+    extended = session.refit(snapshot)  # on a snapshot older than the file
+    assert session.snapshot is extended
     assert not session.stale
-    assert (found.number, found.fit.model.names) == (2, snapshot.fit.model.names)
-    assert len(found.fit.readings) == len(snapshot.fit.readings) + 6
+    assert (extended.number, extended.fit.model.names) == (2, snapshot.fit.model.names)
+    assert len(extended.fit.readings) == len(snapshot.fit.readings) + 6
 
 
 def test_readings_that_come_during_a_fit_are_noticed(run, session, snapshot):
@@ -148,21 +148,21 @@ def test_readings_that_come_during_a_fit_are_noticed(run, session, snapshot):
             with CampaignFile.open(run) as file:
                 file.append_readings(file.readings()[:6])
 
-    found = session.add(snapshot, BASE, meanwhile)
-    assert session.snapshot is found
+    extended = session.add(snapshot, BASE, meanwhile)
+    assert session.snapshot is extended
     assert session.stale
-    refusal("changed by another command; read it again first", session.add, found, BASE)
-    assert len(session.refit(found).fit.readings) == len(snapshot.fit.readings) + 6
+    refusal("changed by another command; read it again first", session.add, extended, BASE)
+    assert len(session.refit(extended).fit.readings) == len(snapshot.fit.readings) + 6
     assert not session.stale
 
 
 @pytest.mark.long
 def test_fitting_anew_keeps_the_prior_of_another_campaign(run):
     earlier, later = run.with_name("earlier.hilcal"), run.with_name("later.hilcal")
-    found = campaign(BASE, "deflection", poses=16).readings
-    for path, part in ((earlier, found.pose < 8), (later, found.pose >= 8)):
+    measured = campaign(BASE, "deflection", poses=16).readings
+    for path, part in ((earlier, measured.pose < 8), (later, measured.pose >= 8)):
         with CampaignFile.create(path, configuration().to_json(), "", "a test") as file:
-            file.append_readings(found[part])
+            file.append_readings(measured[part])
     with Campaign.open(earlier, few_effects()) as o:
         o.append(o.fit_in_use()[1])
         prior = carried_prior(o.posterior(), "arm", {}, o.catalogue)

@@ -61,8 +61,8 @@ def test_the_viewers_files_come_by_the_loopback_address_alone():
         while not done.wait(0.02):
             for process in psutil.Process().children(recursive=True):
                 with contextlib.suppress(psutil.Error):  # it has ended
-                    found = process.net_connections("tcp")
-                    heard.update(c.laddr.ip for c in found if c.status == psutil.CONN_LISTEN)
+                    connections = process.net_connections("tcp")
+                    heard.update(c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN)
 
     watcher = threading.Thread(target=watch)
     watcher.start()
