@@ -36,8 +36,7 @@ from tests.support.foreign_tables import lines as table_of
 from tests.support.foreign_tables import write
 from tests.support.screen import AtTerminal
 from tests.unit.calibration.other_eyes import by_pinocchio, flanges, urdf_model
-from tests.unit.calibration.test_base import by_ur, pose
-from tests.unit.calibration.test_base import true_positions as seen
+from tests.unit.calibration.test_base import by_ur, pose, true_positions
 
 pytestmark = pytest.mark.slow
 HIDDEN, SEED, POSES, RUN = "link_geometry", 5, 20, "rehearsal.hilcal"
@@ -232,7 +231,9 @@ def test_the_report_passes_what_the_truth_passes(day):
     U = float(match[1]) * {"µm": 1e-6, "mm": 1e-3}[match[2]]
     states, c = day.states(), day.calibration()
     predicted = c.predict(states.q, states.wrench).position
-    off = np.linalg.norm(predicted - seen(day.secret.world, states, c.base_in_tracker()), axis=1)
+    off = np.linalg.norm(
+        predicted - true_positions(day.secret.world, states, c.base_in_tracker()), axis=1
+    )
     assert off.max() < 1e-4
     assert np.mean(off <= U) > 0.95
     assert the_same_base(page) == the_same_base(day.said["refine"].text)
@@ -259,7 +260,7 @@ def test_corrected_joint_values_put_the_tool_where_it_was_asked_to_be(day):
     asked_for = (flanges(c.model.cell.arm, states.q) @ tool)[:, :3, 3]
     world = day.secret.world
     before, after = (
-        np.linalg.norm(seen(world, replace(states, q=at), base) - asked_for, axis=1)
+        np.linalg.norm(true_positions(world, replace(states, q=at), base) - asked_for, axis=1)
         for at in (states.q, q)
     )
     band = said.number(r"95 % of the points within ([\d.]+) (\S+);")
@@ -282,7 +283,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     world = day.secret.world
     soft = world.physics.joint_compliance
     stiff = replace(world, physics=replace(world.physics, joint_compliance=0 * soft))
-    wanted, prediction = seen(stiff, states, base), c.predict(states.q)
+    wanted, prediction = true_positions(stiff, states, base), c.predict(states.q)
     urdf, ur = (day.home / "a.urdf").read_text(), (day.home / "a.yaml").read_text()
     exported = {
         "URDF": by_pinocchio(urdf_model(urdf), states.q) @ tool,
@@ -294,7 +295,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
         assert np.mean(off <= prediction.band_m) > 0.9, name
         assert off.mean() < 0.1 * np.linalg.norm(nominal[:, :3, 3] - wanted, axis=1).mean(), name
-    predicted = np.linalg.norm(prediction.position - seen(world, states, base), axis=1)
+    predicted = np.linalg.norm(prediction.position - true_positions(world, states, base), axis=1)
     assert np.mean(predicted <= prediction.band_m) > 0.9
     controller = document["controller"]
     there = inverse(of_six(controller["tracker_in_base_m_rad"]))
